@@ -1,0 +1,14 @@
+"""Doctests run seeded, with ``torch`` at hand."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+
+@pytest.fixture(autouse=True)
+def _doctest(doctest_namespace: dict[str, object]) -> Iterator[None]:
+    doctest_namespace["torch"] = torch
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        yield

@@ -1,0 +1,1 @@
+"""Environments that step many simulators, each with physics of its own, in one native call."""

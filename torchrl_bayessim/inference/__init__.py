@@ -1,0 +1,1 @@
+"""From a prior over parameters to a posterior given summary statistics."""

@@ -1,0 +1,1 @@
+"""Where the parameters go: adapters that write exact values and read them back."""
