@@ -35,7 +35,8 @@ def generator(*key: int | str) -> torch.Generator:
     """Return a CPU generator seeded by ``key``.
 
     Example:
-        >>> torch.rand(1, generator=generator(0, "a")) == torch.rand(1, generator=generator(0, "a"))
+        >>> a, b = generator(0, "a"), generator(0, "a")
+        >>> torch.rand(1, generator=a) == torch.rand(1, generator=b)
         tensor([True])
     """
     return torch.Generator().manual_seed(seed_from(*key))
