@@ -1,0 +1,1 @@
+"""Gymnasium's classic control, many environments at once, each with parameters of its own."""
