@@ -1,0 +1,83 @@
+"""MuJoCo's C functions and raw memory, as seen by compiled code.
+
+Addresses travel as integers. Symbols are resolved by name in the library that the ``mujoco``
+package loads, so compiled code can be cached on disk.
+"""
+# ruff: noqa: ANN001, ANN202, ARG001 - numba infers types, and types intrinsics by example
+
+from __future__ import annotations
+
+__all__ = [
+    "compiled",
+    "doubles",
+    "integers",
+    "mj_forward",
+    "mj_get_state",
+    "mj_jac_site",
+    "mj_reset",
+    "mj_rne",
+    "mj_set_const",
+    "mj_set_state",
+    "mj_step",
+    "take",
+]
+
+import glob
+import os
+from typing import Any
+
+import llvmlite.binding as llvm
+import mujoco
+import numba
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+for _library in glob.glob(os.path.join(os.path.dirname(mujoco.__file__), "libmujoco*")):
+    llvm.load_library_permanently(_library)
+
+compiled = numba.njit(nogil=True, cache=True)
+
+_pointer = types.intp
+_numbers = types.CPointer(types.float64)
+
+
+def _external(name: str, *arguments: types.Type) -> types.ExternalFunction:
+    return types.ExternalFunction(name, types.void(*arguments))
+
+
+mj_step = _external("mj_step", _pointer, _pointer)
+mj_forward = _external("mj_forward", _pointer, _pointer)
+mj_reset = _external("mj_resetData", _pointer, _pointer)
+mj_set_const = _external("mj_setConst", _pointer, _pointer)
+mj_rne = _external("mj_rnePostConstraint", _pointer, _pointer)
+mj_set_state = _external("mj_setState", _pointer, _pointer, _numbers, types.int32)
+mj_get_state = _external("mj_getState", _pointer, _pointer, _numbers, types.int32)
+mj_jac_site = _external("mj_jacSite", _pointer, _pointer, _numbers, _numbers, types.int32)
+
+
+def _doubles(_typing, address):
+    def build(_context, builder, _signature, arguments):
+        return builder.inttoptr(arguments[0], ir.DoubleType().as_pointer())
+
+    return types.CPointer(types.float64)(types.intp), build
+
+
+def _integers(_typing, address):
+    def build(_context, builder, _signature, arguments):
+        return builder.inttoptr(arguments[0], ir.IntType(32).as_pointer())
+
+    return types.CPointer(types.int32)(types.intp), build
+
+
+def _take(_typing, queue):
+    def build(_context, builder, _signature, arguments):
+        pointer = builder.inttoptr(arguments[0], ir.IntType(64).as_pointer())
+        return builder.atomic_rmw("add", pointer, ir.Constant(ir.IntType(64), 1), "seq_cst")
+
+    return types.int64(types.intp), build
+
+
+doubles: Any = intrinsic(_doubles)  # the doubles at an address, to index
+integers: Any = intrinsic(_integers)  # the 32-bit integers at an address, to index
+take: Any = intrinsic(_take)  # add one to the 64-bit integer at an address, return what it was

@@ -1,0 +1,197 @@
+"""N physics for one MuJoCo model: only the entries in which environments differ are stored.
+
+`ModelBatch` keeps one nominal ``MjModel`` and a table ``(N, K)`` with the values of the ``K``
+overridden entries (say, the friction of one geom and the mass of one body). Each thread that steps
+environments has a private copy of the model, and writes row ``i`` of the table into it before
+environment ``i`` is stepped. A thousand environments of a large model thus cost ``K`` numbers each.
+"""
+
+from __future__ import annotations
+
+__all__ = ["ModelBatch"]
+
+import copy
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import PhysicsError, message
+from . import native
+
+# What mj_setConst derives from masses, inertias and geometry (engine_setconst.c); the visual
+# constants of cameras and lights, which it recomputes too, do not enter the dynamics.
+_DERIVED = (
+    "body_subtreemass",
+    "body_invweight0",
+    "dof_invweight0",
+    "dof_M0",
+    "tendon_length0",
+    "tendon_invweight0",
+    "actuator_acc0",
+    "actuator_length0",
+    "stat.meaninertia",
+)
+# Scalars of mjOption and mjStatistic have no array in Python: their distance, in numbers, from
+# one that has (mjmodel.h), checked against the value that Python reads.
+_SCALARS = {
+    "opt.timestep": ("opt.gravity", -7),
+    "opt.impratio": ("opt.gravity", -6),
+    "opt.density": ("opt.gravity", 9),
+    "opt.viscosity": ("opt.gravity", 10),
+    "stat.meaninertia": ("stat.center", -4),
+}
+
+
+def _attribute(model: mujoco.MjModel, field: str) -> Any:
+    value: Any = model
+    for part in field.split("."):
+        value = getattr(value, part)
+    return value
+
+
+def _address(model: mujoco.MjModel, field: str, indices: tuple[int, ...]) -> int:
+    """Return the address of one number of ``model``."""
+    if field in _SCALARS:
+        anchor, offset = _SCALARS[field]
+        return np.asarray(_attribute(model, anchor)).ctypes.data + 8 * offset
+    array = np.asarray(_attribute(model, field))
+    return array.ctypes.data + sum(
+        i * stride for i, stride in zip(indices, array.strides, strict=True)
+    )
+
+
+class ModelBatch:
+    """The physics of ``num_envs`` environments that share one model.
+
+    Example:
+        >>> model = mujoco.MjModel.from_xml_string(
+        ...     "<mujoco><worldbody><body name='ball'><freejoint/><geom size='.1'/></body>"
+        ...     "</worldbody></mujoco>")
+        >>> models = ModelBatch(model, 3)
+        >>> models.write("body_mass", (1,), np.array([1.0, 2.0, 3.0]))
+        >>> models.read("body_mass", (1,))
+        array([1., 2., 3.])
+
+    Args:
+        model: The nominal model. It is never changed; environments start from its values.
+        num_envs: The number of environments ``N``.
+
+    Attributes:
+        model: The nominal model.
+        num_envs: The number of environments.
+        table: Values of the overridden entries, shape ``(N, K)``.
+    """
+
+    def __init__(self, model: mujoco.MjModel, num_envs: int) -> None:
+        self.model = model
+        self.num_envs = num_envs
+        self.table: NDArray[np.float64] = np.empty((num_envs, 0))
+        self._columns: dict[tuple[str, tuple[int, ...]], int] = {}
+        self._scratch: tuple[mujoco.MjModel, mujoco.MjData] | None = None
+        self._derived: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]] | None = None
+
+    def write(
+        self,
+        field: str,
+        indices: tuple[int, ...],
+        values: NDArray[np.float64],
+        rows: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Set one entry of the model in the environments ``rows``.
+
+        Constants that MuJoCo derives from masses, inertias and positions stay stale until
+        `refresh`.
+
+        Args:
+            field: An attribute of ``MjModel`` that holds floating-point numbers (``body_mass``),
+                or one of its options (``opt.gravity``, ``opt.timestep``).
+            indices: The entry: its row and, for a matrix, its column; empty for a scalar.
+            values: One value per environment, in the model's units, shape ``(N,)``.
+            rows: Which environments to write, boolean, shape ``(N,)``; default all.
+
+        Raises:
+            PhysicsError: The model has no such entry.
+            ValueError: ``values`` or ``rows`` has not shape ``(N,)``.
+        """
+        values = np.asarray(values, dtype=np.float64)
+        if values.shape != (self.num_envs,):
+            expected = f"one value per environment, shape ({self.num_envs},)"
+            raise ValueError(message(expected, values.shape))
+        column = self._columns.get((field, indices))
+        if column is None:
+            column = self._add(field, indices)
+        if rows is None:
+            self.table[:, column] = values
+        elif np.shape(rows) == (self.num_envs,):
+            np.copyto(self.table[:, column], values, where=np.asarray(rows))
+        else:
+            expected = f"a mask of environments, shape ({self.num_envs},)"
+            raise ValueError(message(expected, np.shape(rows)))
+
+    def read(self, field: str, indices: tuple[int, ...]) -> NDArray[np.float64]:
+        """Return one entry of the model in every environment, shape ``(N,)``."""
+        column = self._columns.get((field, indices))
+        if column is None:
+            return np.full(self.num_envs, self._nominal(field, indices))
+        return self.table[:, column].copy()
+
+    def refresh(self, rows: NDArray[np.bool_] | None = None) -> None:
+        """Recompute what MuJoCo derives from masses, inertias and positions (``mj_setConst``).
+
+        Args:
+            rows: Which environments to refresh, boolean, shape ``(N,)``; default all.
+        """
+        if self._scratch is None:
+            model = copy.copy(self.model)
+            self._scratch = model, mujoco.MjData(model)
+            for field in _DERIVED:
+                shape = () if field in _SCALARS else np.shape(_attribute(model, field))
+                for indices in np.ndindex(shape):
+                    self._add(field, indices)
+        model, data = self._scratch
+        if self._derived is None:
+            keys = [key for key in self._columns if key[0] in _DERIVED]
+            derived = np.array([_address(model, *key) for key in keys], dtype=np.int64)
+            columns = np.array([self._columns[key] for key in keys], dtype=np.int64)
+            self._derived = self.addresses(model), derived, columns
+        selected = np.arange(self.num_envs) if rows is None else np.flatnonzero(rows)
+        native.refresh(model._address, data._address, selected, self.table, *self._derived)
+
+    def addresses(self, model: mujoco.MjModel) -> NDArray[np.int64]:
+        """Return where the columns of the table belong in a copy of the model, shape ``(K,)``."""
+        return np.array([_address(model, *key) for key in self._columns], dtype=np.int64)
+
+    def copy_of(self, row: int) -> mujoco.MjModel:
+        """Return a model with the physics of environment ``row``, for use outside the batch."""
+        model = copy.copy(self.model)
+        addresses = self.addresses(model)
+        native.override(addresses, self.table, row)
+        return model
+
+    def _add(self, field: str, indices: tuple[int, ...]) -> int:
+        value = self._nominal(field, indices)
+        column = np.full((self.num_envs, 1), value)
+        self.table = np.concatenate([self.table, column], axis=1)
+        self._columns[field, indices] = len(self._columns)
+        self._derived = None
+        return self._columns[field, indices]
+
+    def _nominal(self, field: str, indices: tuple[int, ...]) -> float:
+        try:
+            value = np.asarray(_attribute(self.model, field))
+        except AttributeError:
+            names = [
+                name
+                for name in dir(self.model)
+                if isinstance(getattr(self.model, name, None), np.ndarray)
+            ]
+            raise PhysicsError(message("a field of MjModel", field, available=names)) from None
+        inside = len(indices) == value.ndim and all(
+            0 <= i < n for i, n in zip(indices, value.shape, strict=False)
+        )
+        if not inside or value.dtype != np.float64 or (not indices and field not in _SCALARS):
+            expected = f"the index of a floating-point number in {field} of shape {value.shape}"
+            raise PhysicsError(message(expected, indices))
+        return float(value[indices])

@@ -1,0 +1,253 @@
+"""N MuJoCo environments with physics of their own, as one TorchRL environment.
+
+One native call steps all of them, on all cores, without the interpreter: see `Stepper`. Physics are
+written through ``env.models``, the interface behind `MujocoPhysics`.
+"""
+
+from __future__ import annotations
+
+__all__ = ["BatchedMujocoEnv"]
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from ..errors import message
+from .draws import Draws
+from .model_batch import ModelBatch
+from .stepper import Stepper
+from .task import Readings, Task
+from .tasks.catalogue import known_task
+
+
+class BatchedMujocoEnv(EnvBase):
+    """N environments of one task, each with its own physics, stepped in one native call.
+
+    Observations, rewards and terminations are those of the Gymnasium environment of the same name.
+    A simulation that diverges terminates with the observation it had before, a reward of zero, and
+    ``diverged`` set; the others do not notice.
+
+    Example:
+        >>> env = BatchedMujocoEnv("Hopper-v5", 4)
+        >>> env.models.write("body_mass", (1,), np.array([3.0, 3.5, 4.0, 4.5]))
+        >>> env.models.refresh()
+        >>> env.rollout(10)["next", "reward"].shape
+        torch.Size([4, 10, 1])
+
+    Args:
+        task: A name such as ``Hopper-v5`` or ``FetchPush-v4``, or a `Task`.
+        num_envs: The number of environments ``N``.
+        seed: Seed of the resets. The n-th episode of environment ``i`` starts in a state that
+            depends on ``(seed, i, n)`` only.
+        threads: Threads that step; default all cores that this process may use.
+        time_limit: Control steps before truncation; default the task's.
+        dtype: Of observations and rewards. Simulation is always in double precision.
+
+    Attributes:
+        task: The task.
+        models: The physics of the environments.
+        stepper: The simulations.
+    """
+
+    def __init__(
+        self,
+        task: str | Task,
+        num_envs: int,
+        *,
+        seed: int = 0,
+        threads: int | None = None,
+        time_limit: int | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(message("at least one environment", num_envs))
+        super().__init__(device="cpu", batch_size=torch.Size([num_envs]))
+        self.task = known_task(task) if isinstance(task, str) else task
+        self.num_envs = num_envs
+        self.time_limit = time_limit or self.task.time_limit
+        self._dtype = dtype
+        self.stepper = Stepper(
+            self.task.model,
+            num_envs,
+            outputs=self.task.outputs,
+            drive=self.task.drive,
+            threads=threads,
+        )
+        self._seed = seed
+        self._episodes = np.zeros(num_envs, dtype=np.int64)
+        self._elapsed = torch.zeros(num_envs, 1, dtype=torch.int64)
+        self._extras: dict[str, Tensor] = {}
+        # outputs after the last control step and before it, exchanged at every step
+        size = num_envs, 1, self.stepper.output_size
+        self._outputs = [np.zeros(size), np.zeros(size)]
+        self._start(np.arange(num_envs))
+        self._readings = [self._read(outputs[:, 0]) for outputs in self._outputs]
+        self._make_specs()
+
+    @property
+    def models(self) -> ModelBatch:
+        """The physics of the environments."""
+        return self.stepper.models
+
+    @property
+    def readings(self) -> Readings:
+        """What the task's functions see now; the tensors share memory with the simulations."""
+        return self._readings[0]
+
+    def place(
+        self, components: Mapping[str, Tensor], *, mask: Tensor | None = None
+    ) -> TensorDictBase:
+        """Start episodes in given states, all else being as after a reset.
+
+        Args:
+            components: Components of the state (``qpos``, ``qvel``, ``act``, ``time``, ``ctrl``,
+                ``warmstart``, ``mocap_pos``, …) or of the task (``goal``), shape ``(N, size)``.
+            mask: Which environments, boolean, shape ``(N,)``; default all.
+
+        Returns:
+            What a reset returns.
+        """
+        rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
+        self._start(rows, {name: np.asarray(value)[rows] for name, value in components.items()})
+        return self._started()
+
+    def open_loop(self, actions: Tensor) -> TensorDictBase:
+        """Apply whole sequences of actions in one native call; nothing is reset on the way.
+
+        Args:
+            actions: Shape ``(N, T, A)``.
+
+        Returns:
+            The entries of ``next`` after each action, batch size ``(N, T)``. A simulation that
+            diverges has NaN from there on, and stays in the state it had before the call.
+
+        Raises:
+            ValueError: The shape is another, or an action is not finite.
+        """
+        size = self.action_spec.shape[-1]
+        if actions.ndim != 3 or (actions.shape[0], actions.shape[2]) != (self.num_envs, size):
+            expected = f"actions of shape ({self.num_envs}, T, {size})"
+            raise ValueError(message(expected, tuple(actions.shape)))
+        outputs = self.stepper.rollout(self._commands(actions), substeps=self.task.frame_skip)
+        before = self._read(np.concatenate([self._outputs[0], outputs[:, :-1]], axis=1))
+        after = self._read(outputs)
+        diverged = torch.from_numpy(np.isnan(outputs[..., :1]))
+        steps = torch.arange(1, actions.shape[1] + 1).unsqueeze(-1)
+        elapsed = self._elapsed.unsqueeze(1) + steps
+        reward = self.task.reward(before, after, actions)
+        last = np.where(diverged[:, -1], self._outputs[0][:, 0], outputs[:, -1])
+        self._outputs[0][:, 0] = last
+        self._elapsed = elapsed[:, -1]
+        return self._result(after, reward, elapsed, diverged)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed = 0 if seed is None else seed
+        self._episodes[:] = 0
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
+        self._start(rows)
+        return self._started()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict.get("action")
+        commands = self._commands(action.unsqueeze(1))
+        self._outputs.reverse()
+        self._readings.reverse()
+        self.stepper.rollout(commands, substeps=self.task.frame_skip, outputs=self._outputs[0])
+        after, before = self._readings
+        diverged = torch.from_numpy(self.stepper.status != 0).unsqueeze(-1)
+        if diverged.any():
+            rows = diverged[:, 0].numpy()
+            self._outputs[0][rows] = self._outputs[1][rows]
+        self._elapsed += 1
+        return self._result(after, self.task.reward(before, after, action), self._elapsed, diverged)
+
+    def _start(
+        self, rows: NDArray[np.int64], given: Mapping[str, NDArray[np.float64]] | None = None
+    ) -> None:
+        """Begin the next episode of ``rows``, in the states that the task draws or ``given``."""
+        stepper = self.stepper
+        stepper.state[rows] = stepper.initial
+        components = dict(self.task.initial)
+        if self.task.reset is not None:
+            components |= self.task.reset(Draws(self._seed, rows, self._episodes[rows]))
+        components |= given or {}
+        for name, value in components.items():
+            if name in stepper.components:
+                stepper[name][rows] = value
+            else:
+                if name not in self._extras:
+                    self._extras[name] = torch.zeros(self.num_envs, np.shape(value)[-1]).double()
+                self._extras[name][rows] = torch.as_tensor(value)
+        self._episodes[rows] += 1
+        self._elapsed[rows] = 0
+        stepper.begin(rows, outputs=self._outputs[0][:, 0])
+
+    def _started(self) -> TensorDictBase:
+        no = torch.zeros(self.num_envs, 1, dtype=torch.bool)
+        flags = {key: no.clone() for key in self.done_keys}
+        source = {**self._observe(self.readings), **flags, "diverged": no}
+        return TensorDict(source, batch_size=self.batch_size)
+
+    def _commands(self, actions: Tensor) -> NDArray[np.float64]:
+        if not actions.isfinite().all():
+            rows = (~actions.isfinite()).flatten(1).any(1).nonzero()[:, 0].tolist()
+            raise ValueError(message("finite actions", f"others in environments {rows}"))
+        commands = actions if self.task.command is None else self.task.command(actions)
+        return commands.detach().to(torch.float64).contiguous().numpy()
+
+    def _read(self, outputs: NDArray[np.float64]) -> Readings:
+        """Return outputs, shape ``(N, *T, M)``, by name, with the task's own entries."""
+        readings = {
+            name: torch.from_numpy(self.stepper.view(outputs, name)) for name in self.stepper.layout
+        }
+        for name, value in self._extras.items():
+            readings[name] = value if outputs.ndim == 2 else value.unsqueeze(1)
+        return Readings(**readings)
+
+    def _observe(self, readings: Readings) -> dict[str, Tensor]:
+        observed = self.task.observation(readings)
+        observed = observed if isinstance(observed, dict) else {"observation": observed}
+        return {name: value.to(self._dtype) for name, value in observed.items()}
+
+    def _result(
+        self, after: Readings, reward: Tensor, elapsed: Tensor, diverged: Tensor
+    ) -> TensorDictBase:
+        terminated = diverged.clone()
+        if self.task.termination is not None:
+            terminated = self.task.termination(after).unsqueeze(-1) | diverged
+        source = self._observe(after)
+        source["reward"] = reward.unsqueeze(-1).masked_fill(diverged, 0.0).to(self._dtype)
+        source["diverged"] = diverged
+        source["terminated"] = terminated
+        if self.time_limit is not None:
+            source["truncated"] = elapsed >= self.time_limit
+            source["done"] = terminated | source["truncated"]
+        else:
+            source["done"] = terminated.clone()
+        return TensorDict(source, batch_size=elapsed.shape[:-1])
+
+    def _make_specs(self) -> None:
+        batch, task = self.batch_size, self.task
+        observed = self._observe(self.readings)
+        entries = {k: Unbounded(shape=v.shape, dtype=v.dtype) for k, v in observed.items()}
+        flag = Binary(1, shape=torch.Size((*batch, 1)), dtype=torch.bool)
+        self.observation_spec = Composite({**entries, "diverged": flag}, shape=batch)
+        low, high = task.model.actuator_ctrlrange.T if task.bounds is None else task.bounds
+        size = torch.Size((*batch, len(low)))
+        if task.bounds is None and not task.model.actuator_ctrllimited.all():
+            self.action_spec = Unbounded(shape=size, dtype=torch.float32)
+        else:
+            low, high = (torch.as_tensor(b).float().expand(size).clone() for b in (low, high))
+            self.action_spec = Bounded(low=low, high=high, shape=size, dtype=torch.float32)
+        self.reward_spec = Unbounded(shape=torch.Size((*batch, 1)), dtype=self._dtype)
+        flags = ["done", "terminated"] + ["truncated"] * (self.time_limit is not None)
+        self.done_spec = Composite({name: flag.clone() for name in flags}, shape=batch)

@@ -1,0 +1,230 @@
+"""Compiled loops that call MuJoCo's C functions directly, without the interpreter and its lock.
+
+One thread owns one ``mjModel`` and one ``mjData``. Before it steps environment ``i`` it writes the
+model entries in which environments differ (``table[i]``, at the thread's ``addresses``) and the
+state of environment ``i``; after stepping it reads state and outputs back. All that an environment
+owns is thus a row of ``table`` and a row of ``state``. The state includes the solver's warm start
+and the mocap bodies, so the numbers are those of a private model and data, bit for bit.
+
+Threads draw environments from a shared counter, so a slow environment delays nobody.
+
+The arguments of the kernels, as `Stepper` builds them:
+
+* ``worker``: ``(thread, blocks, addresses, jacobian)``, what one thread owns: addresses in the
+  order of `OWNED`; address and size of each output array; addresses of the columns of ``table``;
+  scratch space ``(6, nv)``;
+* ``batch``: ``(table, state, signature, anchor)``, one row per environment; ``signature`` says what
+  a state holds, ``anchor`` is the last pose of the body that follows the mocap body;
+* ``drive``: ``(relative, weld, pinned, site_ids, contact_forces)``, see `Drive`;
+* ``queue``: one integer, zero at the start, shared by the threads;
+* ``rows``: the environments to treat;
+* ``outputs``: where to write what was read.
+"""
+# ruff: noqa: ANN001, ANN201, ANN202, PLR0917 - numba infers types and takes no keywords
+
+from __future__ import annotations
+
+__all__ = ["DIVERGED", "OVERFLOW", "OWNED", "advance", "begin", "override", "refresh"]
+
+import math
+
+import mujoco
+
+from .libmujoco import (
+    compiled,
+    doubles,
+    integers,
+    mj_forward,
+    mj_get_state,
+    mj_jac_site,
+    mj_reset,
+    mj_rne,
+    mj_set_const,
+    mj_set_state,
+    mj_step,
+    take,
+)
+
+OWNED = ("model", "data", "warning", "qpos", "qvel", "ctrl")
+OWNED += ("mocap_pos", "mocap_quat", "xpos", "xquat")
+DIVERGED, OVERFLOW = 1, 2
+
+_MODEL, _DATA, _WARNING, _QPOS, _QVEL, _CTRL, _MOCAP_POS, _MOCAP_QUAT, _XPOS, _XQUAT = range(10)
+_WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
+_STRIDE = 2  # an mjWarningStat is two 32-bit integers: lastinfo, number
+_CONTACTS_FULL = int(mujoco.mjtWarning.mjWARN_CONTACTFULL)
+_CONSTRAINTS_FULL = int(mujoco.mjtWarning.mjWARN_CNSTRFULL)
+
+
+@compiled
+def _row(array, i):
+    return doubles(array.ctypes.data + i * array.shape[1] * 8)
+
+
+@compiled
+def override(addresses, table, i):
+    """Write row ``i`` of the table into a model."""
+    for j in range(addresses.shape[0]):
+        doubles(addresses[j])[0] = table[i, j]
+
+
+@compiled
+def _hush(thread):
+    # MuJoCo prints and logs a warning only while its count is zero
+    counts = integers(thread[_WARNING])
+    for k in range(_WARNINGS):
+        counts[k * _STRIDE] = 1
+
+
+@compiled
+def _trouble(thread):
+    """What happened since `_hush`: MuJoCo resets the data, and all counts, where it diverges."""
+    counts = integers(thread[_WARNING])
+    code = 0
+    for k in range(_WARNINGS):
+        if counts[k * _STRIDE] != 1:
+            if k not in (_CONTACTS_FULL, _CONSTRAINTS_FULL):
+                return DIVERGED
+            code = OVERFLOW
+    return code
+
+
+@compiled
+def _collect(thread, blocks, site_ids, jacobian, output):
+    """Copy arrays of mjData, then the velocities J(q) q̇ of sites, to ``output``."""
+    at = 0
+    for b in range(blocks.shape[0]):
+        source = doubles(blocks[b, 0])
+        for j in range(blocks[b, 1]):
+            output[at + j] = source[j]
+        at += blocks[b, 1]
+    nv = jacobian.shape[1]
+    qvel = doubles(thread[_QVEL])
+    for s in range(site_ids.shape[0]):
+        mj_jac_site(
+            thread[_MODEL], thread[_DATA], _row(jacobian, 0), _row(jacobian, 3), site_ids[s]
+        )
+        for axis in range(6):
+            total = 0.0
+            for v in range(nv):
+                total += jacobian[axis, v] * qvel[v]
+            output[at + axis] = total
+        at += 6
+
+
+@compiled
+def _command(thread, drive, command, anchor):
+    """Write controls, some relative to a position, and step the mocap body from its weld."""
+    relative, weld = drive[0], drive[1]
+    qpos, ctrl = doubles(thread[_QPOS]), doubles(thread[_CTRL])
+    nu = relative.shape[0]
+    for j in range(nu):
+        ctrl[j] = command[j] + qpos[relative[j]] if relative[j] >= 0 else command[j]
+    if weld >= 0:
+        position, quaternion = doubles(thread[_MOCAP_POS]), doubles(thread[_MOCAP_QUAT])
+        for j in range(3):
+            position[j] = anchor[j] + command[nu + j]
+        for j in range(4):
+            quaternion[j] = anchor[3 + j] + command[nu + 3 + j]
+
+
+@compiled
+def _remember(thread, weld, anchor):
+    """Keep the pose of the welded body, from which the next command steps the mocap body."""
+    if weld >= 0:
+        position, quaternion = doubles(thread[_XPOS]), doubles(thread[_XQUAT])
+        for j in range(3):
+            anchor[j] = position[3 * weld + j]
+        for j in range(4):
+            anchor[3 + j] = quaternion[4 * weld + j]
+
+
+@compiled
+def _control_step(thread, drive, substeps):
+    _, _, pinned, _, contact_forces = drive
+    m, d = thread[_MODEL], thread[_DATA]
+    for _ in range(substeps):
+        mj_step(m, d)
+        code = _trouble(thread)
+        if code:
+            return code
+    if pinned.shape[0]:
+        qpos = doubles(thread[_QPOS])
+        for j in pinned:
+            qpos[j] = 0.0
+        mj_forward(m, d)
+    if contact_forces:
+        mj_rne(m, d)
+    return 0
+
+
+@compiled
+def begin(worker, batch, drive, queue, rows, outputs):
+    """Set the states of ``rows`` in clean data, and evaluate the outputs there."""
+    thread, blocks, addresses, jacobian = worker
+    table, state, signature, anchor = batch
+    _, weld, _, site_ids, _ = drive
+    m, d = thread[_MODEL], thread[_DATA]
+    while True:
+        k = take(queue.ctypes.data)
+        if k >= rows.shape[0]:
+            break
+        i = rows[k]
+        mj_reset(m, d)
+        _hush(thread)
+        override(addresses, table, i)
+        mj_set_state(m, d, _row(state, i), signature)
+        mj_forward(m, d)
+        mj_get_state(m, d, _row(state, i), signature)
+        _remember(thread, weld, anchor[i])
+        _collect(thread, blocks, site_ids, jacobian, outputs[i])
+
+
+@compiled
+def advance(worker, batch, drive, queue, rows, outputs, commands, sequence, substeps, status):
+    """Apply ``commands[sequence[i]]``, shape ``(T, C)``, to each ``i`` of ``rows``.
+
+    Writes ``outputs[i]``, shape ``(T, M)``, the new state, and ``status[i]``. Where a simulation
+    diverges the state stays as it was and the outputs are NaN from that control step on.
+    """
+    thread, blocks, addresses, jacobian = worker
+    table, state, signature, anchor = batch
+    _, weld, _, site_ids, _ = drive
+    m, d = thread[_MODEL], thread[_DATA]
+    while True:
+        k = take(queue.ctypes.data)
+        if k >= rows.shape[0]:
+            break
+        i = rows[k]
+        _hush(thread)
+        override(addresses, table, i)
+        mj_set_state(m, d, _row(state, i), signature)
+        code = 0
+        for t in range(commands.shape[1]):
+            if code == 0:
+                _command(thread, drive, commands[sequence[i], t], anchor[i])
+                code = _control_step(thread, drive, substeps)
+            if code:
+                outputs[i, t] = math.nan
+            else:
+                _remember(thread, weld, anchor[i])
+                _collect(thread, blocks, site_ids, jacobian, outputs[i, t])
+        status[i] = code
+        if code:
+            mj_reset(m, d)
+        else:
+            mj_get_state(m, d, _row(state, i), signature)
+
+
+@compiled
+def refresh(model, data, rows, table, addresses, derived, columns):
+    """Let MuJoCo recompute the constants that depend on the overrides of ``rows``.
+
+    ``derived`` are the addresses of those constants in the scratch ``model``, and ``columns`` their
+    places in the table.
+    """
+    for i in rows:
+        override(addresses, table, i)
+        mj_set_const(model, data)
+        for j in range(derived.shape[0]):
+            table[i, columns[j]] = doubles(derived[j])[0]

@@ -1,0 +1,96 @@
+"""What turns a MuJoCo model into a task: observation, reward, termination, reset, as functions.
+
+All functions act on a whole batch. They receive `Readings`: tensors by name, the outputs that the
+task asks the simulator for (arrays of ``MjData``, shape ``(*batch, *shape)``) and whatever its
+reset returned beside the state (a goal). Positions and forces that MuJoCo derives from the state
+are as old as in any program that calls ``mj_step``: of the start of the last time step.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Readings", "Task", "uniform_reset"]
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .draws import Draws
+from .stepper import Drive
+
+Readings = SimpleNamespace
+Reset = Callable[[Draws], Mapping[str, NDArray[np.float64]]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """A model and the functions that make a decision problem of it.
+
+    Example:
+        >>> ball = mujoco.MjModel.from_xml_string(
+        ...     "<mujoco><worldbody><body><joint name='x' type='slide'/><geom size='.1'/></body>"
+        ...     "</worldbody><actuator><motor joint='x' ctrlrange='-1 1'/></actuator></mujoco>")
+        >>> task = Task(
+        ...     model=ball,
+        ...     frame_skip=5,
+        ...     observation=lambda now: torch.cat([now.qpos, now.qvel], -1),
+        ...     reward=lambda before, now, action: -now.qpos[..., 0].abs(),
+        ...     termination=lambda now: now.qpos[..., 0].abs() > 1.0,
+        ...     reset=uniform_reset(ball, 0.1),
+        ... )
+
+    Attributes:
+        model: The model, in its nominal physics.
+        frame_skip: Time steps per control step.
+        observation: ``readings -> (*batch, O)``, or a dictionary of such tensors.
+        reward: ``(before, after, action) -> (*batch,)``.
+        termination: ``readings -> (*batch,)`` boolean; default never.
+        reset: ``draws -> {component of the state or own name: (B, size)}``; default the model's
+            initial state.
+        outputs: What to read, see `Stepper`.
+        time_limit: Control steps before truncation.
+        drive: How commands enter, see `Drive`.
+        command: ``action (*batch, A) -> (*batch, C)``; default the action itself.
+        bounds: Lowest and highest action, shape ``(A,)`` each; default those of the actuators.
+        initial: Components of the state at the start of every episode, before ``reset``.
+    """
+
+    model: mujoco.MjModel
+    frame_skip: int
+    observation: Callable[[Readings], Tensor | dict[str, Tensor]]
+    reward: Callable[[Readings, Readings, Tensor], Tensor]
+    termination: Callable[[Readings], Tensor] | None = None
+    reset: Reset | None = None
+    outputs: tuple[str, ...] = ("qpos", "qvel")
+    time_limit: int | None = None
+    drive: Drive = field(default_factory=Drive)
+    command: Callable[[Tensor], Tensor] | None = None
+    bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+    initial: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+
+    @property
+    def dt(self) -> float:
+        """Seconds per control step."""
+        return self.model.opt.timestep * self.frame_skip
+
+
+def uniform_reset(model: mujoco.MjModel, scale: float, *, velocity: str = "uniform") -> Reset:
+    """Return a reset that adds noise to ``qpos0`` and to zero velocity.
+
+    Args:
+        model: The model.
+        scale: Positions get ``U(-scale, scale)``, in their own units (quaternions too).
+        velocity: ``uniform``, the same for velocities, or ``normal``, ``N(0, scale²)``.
+    """
+
+    def reset(draws: Draws) -> dict[str, NDArray[np.float64]]:
+        qpos = model.qpos0 + draws.uniform(-scale, scale, size=model.nq)
+        if velocity == "normal":
+            return {"qpos": qpos, "qvel": scale * draws.normal(size=model.nv)}
+        return {"qpos": qpos, "qvel": draws.uniform(-scale, scale, size=model.nv)}
+
+    return reset
