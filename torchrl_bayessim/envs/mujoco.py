@@ -140,7 +140,7 @@ class BatchedMujocoEnv(EnvBase):
         diverged = torch.from_numpy(np.isnan(outputs[..., :1]))
         steps = torch.arange(1, actions.shape[1] + 1).unsqueeze(-1)
         elapsed = self._elapsed.unsqueeze(1) + steps
-        reward = self.task.reward(before, after, actions)
+        reward = self.task.reward(before, after, actions.double())
         last = np.where(diverged[:, -1], self._outputs[0][:, 0], outputs[:, -1])
         self._outputs[0][:, 0] = last
         self._elapsed = elapsed[:, -1]
@@ -168,7 +168,8 @@ class BatchedMujocoEnv(EnvBase):
             rows = diverged[:, 0].numpy()
             self._outputs[0][rows] = self._outputs[1][rows]
         self._elapsed += 1
-        return self._result(after, self.task.reward(before, after, action), self._elapsed, diverged)
+        reward = self.task.reward(before, after, action.double())
+        return self._result(after, reward, self._elapsed, diverged)
 
     def _start(
         self, rows: NDArray[np.int64], given: Mapping[str, NDArray[np.float64]] | None = None
@@ -216,7 +217,8 @@ class BatchedMujocoEnv(EnvBase):
     def _observe(self, readings: Readings) -> dict[str, Tensor]:
         observed = self.task.observation(readings)
         observed = observed if isinstance(observed, dict) else {"observation": observed}
-        return {name: value.to(self._dtype) for name, value in observed.items()}
+        # a copy, since an observation may be a view of what the next step overwrites
+        return {name: value.to(self._dtype, copy=True) for name, value in observed.items()}
 
     def _result(
         self, after: Readings, reward: Tensor, elapsed: Tensor, diverged: Tensor

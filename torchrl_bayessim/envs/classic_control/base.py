@@ -18,7 +18,7 @@ from typing import ClassVar
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, OneHot, Unbounded
+from torchrl.data import Categorical, Composite, OneHot, Unbounded
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.envs import EnvBase
 
@@ -214,16 +214,15 @@ class ClassicControlEnv(EnvBase):
         spec = self.action_spec
         if action.shape != spec.shape:
             raise ValueError(message(f"actions of shape {tuple(spec.shape)}", tuple(action.shape)))
-        if isinstance(spec, Bounded):
-            # Beyond the bounds the actuator saturates, in `_advance`, as it does in gymnasium.
-            valid, value = action.isfinite(), action
-            kind = "finite actions"
-        elif isinstance(spec, OneHot):
+        value = action
+        if isinstance(spec, OneHot):
             valid = (action.count_nonzero(-1) == 1) & (action.amax(-1) == 1)
             value, kind = action.to(torch.uint8).argmax(-1), "one-hot actions"
+        elif isinstance(spec, Categorical):
+            valid, kind = (action >= 0) & (action < spec.n), f"actions from 0 to {spec.n - 1}"
         else:
-            valid = (action >= 0) & (action < spec.n)
-            value, kind = action, f"actions from 0 to {spec.n - 1}"
+            # Beyond the bounds the actuator saturates, in `_advance`, as it does in gymnasium.
+            valid, kind = action.isfinite(), "finite actions"
         if not valid.all():
             rows = (~valid.view(self.batch_size[0])).nonzero().squeeze(-1)[:5]
             got = f"{action[rows].tolist()} in environments {rows.tolist()}"
