@@ -114,14 +114,15 @@ class ApplyPhysics(Transform):
         if tensordict is None:
             tensordict = TensorDict(batch_size=env.batch_size, device=env.device)
         shape = (*tensordict.batch_size, len(self.names))
-        theta = tensordict.get(self.key, None)
-        if theta is None:
-            nominal = [env.__dict__["_nominal_physics"][name] for name in self.names]
-            theta = torch.stack(nominal, -1).expand(shape)
-        theta = theta.to("cpu", torch.float64)
+        nominal = torch.stack([env.__dict__["_nominal_physics"][name] for name in self.names], -1)
+        theta = tensordict.get(self.key, nominal.expand(shape)).to("cpu", torch.float64)
         mask = _resets(self.parent, tensordict)
-        if theta.shape != shape or not theta[mask].isfinite().all():
-            raise ValueError(message(f"finite θ of shape {shape}: {self.names}", theta.tolist()))
+        if theta.shape != shape:
+            raise ValueError(message(f"θ of shape {shape}: {self.names}", tuple(theta.shape)))
+        # A nominal NaN stands for entries that differ; carried through a reset, it restores them.
+        bad = mask[..., None] & ~theta.isfinite() & nominal.isfinite()
+        if bad.any():
+            raise ValueError(message(f"finite θ: {self.names}", theta[bad.any(-1)][0].tolist()))
         self.physics.write(env, theta, mask=mask, tensordict=tensordict)
         self._written = theta
         return tensordict
@@ -133,7 +134,7 @@ class ApplyPhysics(Transform):
         held = self.physics.read(env, tensordict=tensordict_reset).to("cpu", torch.float64)
         assert self._written is not None  # TransformedEnv calls _reset_env_preprocess first
         mask = _resets(self.parent, tensordict)[..., None]
-        wrong = mask & ~torch.isclose(held, self._written, rtol=1e-6, atol=1e-12)
+        wrong = mask & ~torch.isclose(held, self._written, rtol=1e-6, atol=1e-12, equal_nan=True)
         if wrong.any():
             *row, column = wrong.nonzero()[0].tolist()
             raise PhysicsError(
@@ -335,7 +336,7 @@ class DomainRandomizer(Transform):
         self._check_names()
         mask = _resets(self.parent, tensordict)
         drawn, held = tensordict[self.key][mask], tensordict_reset[self.key][mask]
-        if not torch.allclose(drawn, held, rtol=1e-6, atol=0):
+        if not torch.allclose(drawn, held, rtol=1e-6, atol=1e-12):
             raise PhysicsError(
                 message(
                     f"the simulators to hold what was drawn, {drawn.tolist()}",
