@@ -1,0 +1,240 @@
+"""Fit a posterior to pairs of parameters and summaries: minibatches, early stopping, a report."""
+
+from __future__ import annotations
+
+__all__ = ["FitReport", "fit", "select_lengthscale", "usable_pairs"]
+
+import copy
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from ..errors import SimulationError, message
+from ..randomness import generator
+from .features import FourierFeatures
+from .losses import PosteriorLoss
+from .posterior import MixtureDensityPosterior
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What a fit did.
+
+    Attributes:
+        pairs: Number of pairs used for training and validation together.
+        dropped: Number of pairs left out because a simulation diverged or was not finite.
+        epochs: Epochs run; the parameters kept are those of the best one.
+        train: Training loss per epoch, in nats.
+        validation: Loss on held-out pairs per epoch, in nats.
+    """
+
+    pairs: int
+    dropped: int
+    epochs: int
+    train: list[float] = field(repr=False)
+    validation: list[float] = field(repr=False)
+
+    @property
+    def best(self) -> float:
+        """The lowest held-out loss, in nats."""
+        return min(self.validation)
+
+
+def usable_pairs(data: TensorDictBase) -> tuple[TensorDictBase, int]:
+    """Return the pairs whose parameters and summaries are finite, and how many were dropped.
+
+    Raises:
+        SimulationError: If none is left.
+    """
+    good = data["theta"].isfinite().all(-1) & data["summary"].isfinite().all(-1)
+    dropped = int((~good).sum())
+    if dropped == good.numel():
+        raise SimulationError(
+            message(
+                "at least one simulation with finite summaries",
+                f"{dropped} diverged simulations of {dropped}",
+                hint="a smaller prior, a smaller time step, or a summary that masks the divergence",
+            )
+        )
+    return data[good], dropped
+
+
+def fit(
+    posterior: MixtureDensityPosterior,
+    data: TensorDictBase,
+    *,
+    epochs: int = 300,
+    batch_size: int = 128,
+    lr: float = 2e-3,
+    weight_decay: float = 1e-4,
+    validation_fraction: float = 0.1,
+    patience: int = 30,
+    rescale: bool = True,
+    seed: int = 0,
+    progress: bool = True,
+) -> FitReport:
+    """Maximise the posterior's log-density over pairs ``{"theta", "summary"[, "weight"]}``.
+
+    Adam with a cosine learning rate; after every epoch the loss on held-out pairs is computed, and
+    the parameters of the best epoch are kept. Pairs that are not finite are dropped and counted.
+
+    Args:
+        posterior: Changed in place.
+        data: Batch size ``(N,)``; ``"theta"`` ``(N, D)``, ``"summary"`` ``(N, L)``.
+        epochs: At most so many passes.
+        batch_size: Pairs per step.
+        lr: Initial learning rate.
+        weight_decay: Of AdamW.
+        validation_fraction: Share of the pairs that is held out, at least one pair.
+        patience: Stop after so many epochs without improvement.
+        rescale: Whether to set the input scaling from these pairs (yes on the first fit).
+        seed: Of the split and of the minibatches.
+        progress: Whether to show a progress bar.
+
+    Raises:
+        ValueError: For fewer than 4 usable pairs, or shapes that do not match the posterior.
+        SimulationError: If no pair is finite, or the loss is not.
+    """
+    pairs, dropped = usable_pairs(data.select("theta", "summary", "weight", strict=False))
+    if dropped:
+        warnings.warn(
+            f"{dropped} of {len(data)} simulations are not finite: left out", stacklevel=2
+        )
+    _check_pairs(posterior, pairs)
+    order = torch.randperm(len(pairs), generator=generator(seed, "split"))
+    held_out = max(1, round(validation_fraction * len(pairs)))
+    validation, train = pairs[order[:held_out]], pairs[order[held_out:]].contiguous()
+    if rescale:
+        posterior.network.standardize_inputs(train.get("summary"))
+    trace = _descend(
+        posterior,
+        train,
+        validation,
+        epochs=epochs,
+        batch_size=batch_size,
+        lr=lr,
+        weight_decay=weight_decay,
+        patience=patience,
+        seed=seed,
+        progress=progress,
+    )
+    return FitReport(len(pairs), dropped, len(trace[0]), *trace)
+
+
+def _check_pairs(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> None:
+    if len(pairs) < 4:
+        raise ValueError(message("at least 4 usable pairs", len(pairs), hint="simulate more"))
+    expected = (len(posterior.prior.names), len(posterior.network.shift))
+    got = (pairs["theta"].shape[-1], pairs["summary"].shape[-1])
+    if got != expected:
+        raise ValueError(message("pairs with (D, L) of the posterior, " + str(expected), got))
+    outside = ~posterior.prior.contains(pairs["theta"])
+    if outside.any():
+        row = int(outside.nonzero()[0])
+        raise ValueError(
+            message(
+                f"parameters inside the prior {posterior.prior!r}",
+                f"{int(outside.sum())} outside it, the first {pairs['theta'][row].tolist()}",
+                hint="the prior that the parameters were drawn from",
+            )
+        )
+
+
+def _descend(
+    posterior: MixtureDensityPosterior,
+    train: TensorDictBase,
+    validation: TensorDictBase,
+    *,
+    epochs: int,
+    batch_size: int,
+    lr: float,
+    weight_decay: float,
+    patience: int,
+    seed: int,
+    progress: bool,
+) -> tuple[list[float], list[float]]:
+    loss_module = PosteriorLoss(posterior)
+    optimizer = torch.optim.AdamW(posterior.parameters(), lr=lr, weight_decay=weight_decay)
+    batches = math.ceil(len(train) / batch_size)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs * batches)
+    shuffle = generator(seed, "minibatches")
+    best, best_state, stale = math.inf, copy.deepcopy(posterior.state_dict()), 0
+    losses: tuple[list[float], list[float]] = ([], [])
+    bar = tqdm(range(epochs), desc="fit", disable=not progress, leave=False, unit="epoch")
+    for _ in bar:
+        total = 0.0
+        for rows in torch.randperm(len(train), generator=shuffle).chunk(batches):
+            loss = loss_module(train[rows])["loss_posterior"]
+            _check_loss(loss)
+            optimizer.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(posterior.parameters(), 10.0)
+            optimizer.step()
+            schedule.step()
+            total += loss.item() * len(rows) / len(train)
+        with torch.no_grad():
+            held_out = loss_module(validation)["loss_posterior"].item()
+        losses[0].append(total)
+        losses[1].append(held_out)
+        bar.set_postfix(train=f"{total:.2f}", held_out=f"{held_out:.2f}")
+        stale += 1
+        if held_out < best - 1e-4:
+            best, best_state, stale = held_out, copy.deepcopy(posterior.state_dict()), 0
+        if stale >= patience:
+            break
+    posterior.load_state_dict(best_state)
+    return losses
+
+
+def _check_loss(loss: Tensor) -> None:
+    if not loss.isfinite():
+        raise SimulationError(
+            message(
+                "a finite loss",
+                loss.item(),
+                hint="a smaller learning rate, or fewer constant or redundant statistics",
+            )
+        )
+
+
+def select_lengthscale(
+    posterior: MixtureDensityPosterior,
+    data: TensorDictBase,
+    *,
+    factors: Sequence[float] = (0.25, 0.5, 1.0, 2.0, 4.0),
+    epochs: int = 40,
+    seed: int = 0,
+    progress: bool = True,
+) -> float:
+    """Set the length scale of Fourier features by cross-validation, and return it.
+
+    The grid is the median distance between standardised summaries (the median heuristic) times
+    each of ``factors``; the one with the lowest held-out loss after a short fit is kept. The
+    posterior's weights are left as they were.
+
+    Raises:
+        TypeError: If the posterior's features are not Fourier features.
+    """
+    network = posterior.network
+    features = network.features
+    if not isinstance(features, FourierFeatures):
+        raise TypeError(message("a posterior over FourierFeatures", type(features).__name__))
+    pairs, _ = usable_pairs(data)
+    network.standardize_inputs(pairs["summary"])
+    some = torch.randperm(len(pairs), generator=generator(seed, "median"))[:500]
+    median = torch.pdist(network.scaled(pairs["summary"][some])).median().item()
+    scores = {}
+    for factor in factors:
+        trial = copy.deepcopy(posterior)
+        trial.network.features.lengthscale.fill_(factor * median)  # pyright: ignore[reportCallIssue]
+        report = fit(trial, pairs, epochs=epochs, seed=seed, progress=progress)
+        scores[factor * median] = report.best
+    best = min(scores, key=scores.__getitem__)
+    features.lengthscale.fill_(best)
+    return best

@@ -1,0 +1,96 @@
+r"""The loss of a posterior, as a TorchRL loss.
+
+.. math::
+    \ell(\phi) = -\sum_i w_i \log q_\phi(\theta_i \mid x_i) \Big/ \sum_i w_i,
+
+minimised by the true posterior under a flexible enough q (BayesSim, arXiv:1906.01728, eq. 8). The
+weights :math:`w = p(\theta) / \tilde p(\theta)` are 1 unless the simulations were drawn from a
+proposal :math:`\tilde p`: see :mod:`torchrl_bayessim.inference.proposals`.
+"""
+
+from __future__ import annotations
+
+__all__ = ["PosteriorLoss"]
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
+from torchrl.objectives.common import LossModule
+
+from ..errors import message
+
+
+class PosteriorLoss(LossModule):
+    """Negative log-density of the parameters under the posterior, weighted and masked.
+
+    Args:
+        posterior_network: A posterior with ``get_dist`` such as ``MixtureDensityPosterior``.
+        reduction: ``"mean"`` (weighted), ``"sum"`` or ``"none"``.
+
+    Keys (change with ``set_keys``): ``theta`` the parameters ``(*, D)``, ``weight`` importance
+    weights ``(*)``, used where present; ``mask`` booleans ``(*)``, used where present.
+
+    Example:
+        >>> from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
+        >>> from torchrl_bayessim.inference.priors import BoxPrior
+        >>> loss = PosteriorLoss(MixtureDensityPosterior(BoxPrior({"mass": (2.0, 6.0)}), 4))
+        >>> data = TensorDict({"summary": torch.randn(8, 4), "theta": torch.full((8, 1), 4.0)}, [8])
+        >>> loss(data)["loss_posterior"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        theta: NestedKey = "theta"
+        weight: NestedKey = "weight"
+        mask: NestedKey = ("collector", "mask")
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_posterior"]  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+    posterior_network: ProbabilisticTensorDictSequential
+    posterior_network_params: TensorDictParams
+    target_posterior_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        posterior_network: ProbabilisticTensorDictSequential,
+        *,
+        reduction: Literal["mean", "sum", "none"] = "mean",
+    ) -> None:
+        super().__init__()
+        if reduction not in {"mean", "sum", "none"}:
+            raise ValueError(message("a reduction", reduction, available=["mean", "sum", "none"]))
+        self.reduction = reduction
+        self.convert_to_functional(posterior_network, "posterior_network")
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The summaries and the parameters."""
+        return [*self.posterior_network.in_keys, self.tensor_keys.theta]
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        del kwargs  # no value estimator
+
+    @dispatch  # pyright: ignore[reportArgumentType]
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return ``{"loss_posterior": ...}`` for pairs of summaries and parameters."""
+        keys = self.tensor_keys
+        with self.posterior_network_params.to_module(self.posterior_network):
+            inputs = tensordict.select(*self.posterior_network.in_keys)
+            distribution = self.posterior_network.get_dist(inputs)
+        loss = -distribution.log_prob(tensordict.get(keys.theta))
+        if self.reduction == "none":
+            return TensorDict({"loss_posterior": loss})
+        weight = tensordict.get(keys.weight, None)
+        weight = torch.ones_like(loss) if weight is None else weight.reshape(loss.shape)
+        mask = tensordict.get(keys.mask, None)
+        if mask is not None:
+            weight = torch.where(mask.reshape(loss.shape), weight, 0.0)
+        # a row of weight 0 may hold anything, NaN included
+        total = torch.where(weight > 0, weight * loss, 0.0).sum()
+        if self.reduction == "mean":
+            total = total / weight.sum().clamp_min(1e-12)
+        return TensorDict({"loss_posterior": total})

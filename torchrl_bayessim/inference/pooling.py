@@ -1,0 +1,49 @@
+r"""One posterior from several independent trajectories.
+
+For trajectories that are independent given the parameters,
+
+.. math::
+    p(\theta \mid x_1 \dots x_n) \propto p(\theta)^{1-n} \prod_i p(\theta \mid x_i) .
+
+In standardised coordinates a box prior is constant and drops out, and a Gaussian prior is N(0, I).
+The product of mixtures is a mixture again; after every factor it is reduced to a bounded number of
+components. The factors are sorted first, so the order of the trajectories does not matter.
+"""
+
+from __future__ import annotations
+
+__all__ = ["pool"]
+
+import torch
+
+from .mixtures import Mixture, divide, multiply, reduce
+from .truncation import TruncatedGaussianMixture
+
+MAX_COMPONENTS = 24
+
+
+def pool(each: TruncatedGaussianMixture, *, bounded: bool) -> TruncatedGaussianMixture:
+    """Return the pooled posterior of a batch ``(n,)`` of posteriors, in standardised coordinates.
+
+    Args:
+        each: One mixture per trajectory, batch shape ``(n,)``.
+        bounded: Whether the prior is a box (constant in these coordinates) or N(0, I).
+
+    Example:
+        >>> each = TruncatedGaussianMixture(torch.zeros(4, 1), torch.zeros(4, 1, 1),
+        ...                                 torch.ones(4, 1, 1, 1), None)
+        >>> pool(each, bounded=True).scale_tril.flatten()
+        tensor([0.5000], dtype=torch.float64)
+    """
+    mean = (each.logits.exp().unsqueeze(-1) * each.loc).sum(-2)
+    keys = mean.tolist()
+    order = sorted(range(len(keys)), key=lambda i: (keys[i], each.logits[i].tolist()))
+    factors = [Mixture(each.untruncated_logits[i], each.loc[i], each.scale_tril[i]) for i in order]
+    product = factors[0]
+    identity = torch.eye(each.loc.shape[-1], dtype=each.loc.dtype)
+    for factor in factors[1:]:
+        product = multiply(product, factor)
+        if not bounded:
+            product = divide(product, torch.zeros_like(identity[0]), identity).mixture
+        product = reduce(product, MAX_COMPONENTS)
+    return TruncatedGaussianMixture.restrict(*product, each.box, diagonal=False)

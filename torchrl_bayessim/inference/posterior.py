@@ -1,0 +1,342 @@
+r"""BayesSim's posterior: a mixture density network over features of the summary statistics.
+
+.. math::
+    q_\phi(\theta \mid x) = \Big|\tfrac{\partial z}{\partial\theta}\Big|
+    \sum_{k=1}^K \pi_k(x)\, \frac{N(z; \mu_k(x), \Sigma_k(x))}{Z_k(x)}
+    \quad\text{inside the prior's support, 0 outside,}
+
+with :math:`z` the standardised parameters, :math:`Z_k` the mass of component k inside the prior's
+box, and weights, means and covariances linear in the features of :math:`x` (Ramos, Possas & Fox,
+2019, "BayesSim: adaptive domain randomization via probabilistic inference for robotics
+simulators", arXiv:1906.01728, eq. 9-13). Nothing leaks outside the box and nothing is clipped.
+"""
+
+from __future__ import annotations
+
+__all__ = ["MixtureDensityNetwork", "MixtureDensityPosterior", "PhysicsPosterior", "melu"]
+
+from collections.abc import Sequence
+from functools import partial
+from typing import ClassVar, Literal
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+)
+from torch import Tensor, nn
+from torch.distributions import Distribution
+
+from ..errors import message
+from .features import Features, FourierFeatures, NeuralFeatures
+from .mixtures import Mixture
+from .pooling import pool
+from .priors import Prior
+from .truncation import POINTS, TruncatedGaussianMixture
+
+Covariance = Literal["diagonal", "full"]
+Pooling = Literal["product", "mean"]
+MAPS = {"neural": NeuralFeatures, "fourier": FourierFeatures}
+WIDEST = 4.0  # of a component, in prior deviations: nearly flat over a box, which spans 3.5
+STEEPEST = 100.0  # ratio of a marginal to a conditional deviation
+TRAINING_POINTS = 16  # for the mass of correlated components while the loss is minimised
+FLOOR = 1e-8  # of a variance, in standardised coordinates: a deviation of 1e-4 prior deviations
+
+
+def melu(z: Tensor) -> Tensor:
+    r"""The paper's modified ELU, :math:`e^z` for :math:`z < 0` and :math:`z + 1` above: a variance.
+
+    The paper's constant alpha must be 1: smaller leaves a floor of 1 - alpha, larger allows
+    negative variances. Computed without the cancellation of ``elu(z) + 1``, which is exactly 0 in
+    float32 below z = -16.
+
+    Example:
+        >>> melu(torch.tensor([-40.0, 0.0, 2.0])) > 0
+        tensor([True, True, True])
+    """
+    return torch.where(z < 0, z.clamp(max=0.0).exp(), z + 1) + FLOOR
+
+
+class PhysicsPosterior(Distribution):
+    """A distribution over physics parameters: a truncated mixture seen through the prior's scaling.
+
+    Args:
+        mixture: In standardised coordinates, batch shape ``(*)``.
+        prior: Whose coordinates, names, units and support are used.
+
+    Example:
+        >>> from torchrl_bayessim.inference.priors import BoxPrior
+        >>> prior = BoxPrior({"mass": (2.0, 6.0)})
+        >>> q = PhysicsPosterior(TruncatedGaussianMixture(torch.zeros(1), torch.zeros(1, 1),
+        ...     0.1 * torch.eye(1)[None], prior.box, diagonal=True), prior)
+        >>> q.names, round(q.mean.item(), 3), round(q.stddev.item(), 3)
+        (('mass',), 4.0, 0.115)
+    """
+
+    arg_constraints: ClassVar[dict] = {}
+    has_rsample = False
+
+    def __init__(self, mixture: TruncatedGaussianMixture, prior: Prior) -> None:
+        self.mixture, self.prior = mixture, prior
+        self.names, self.units = prior.names, prior.units
+        super().__init__(mixture.batch_shape, mixture.event_shape, validate_args=False)
+
+    @property
+    def support(self) -> torch.distributions.constraints.Constraint:  # noqa: D102
+        return self.prior.support  # pyright: ignore[reportReturnType]
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log-density in the parameters' own units, shape ``(*)``."""
+        z = self.prior.standardize(value.double())
+        volume = self.prior.standardization.log_abs_det_jacobian(z, value.double())
+        return (self.mixture.log_prob(z) - volume).to(torch.get_default_dtype())
+
+    def sample(
+        self, sample_shape: Sequence[int] = (), *, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Return draws of shape ``(*sample_shape, *, D)``, from ``generator`` if one is given."""
+        z = self.mixture.sample(sample_shape, generator=generator)
+        return self.prior.unstandardize(z).to(torch.get_default_dtype())
+
+    def _expectation(self, power: int) -> Tensor:
+        points, weight = self.mixture.quadrature()
+        theta = self.prior.unstandardize(points)
+        return (weight.unsqueeze(-1) * theta**power).sum(0)
+
+    @property
+    def mean(self) -> Tensor:
+        """The posterior means, shape ``(*, D)``, by a fixed quadrature."""
+        return self._expectation(1).to(torch.get_default_dtype())
+
+    @property
+    def variance(self) -> Tensor:
+        """The posterior variances, shape ``(*, D)``, by a fixed quadrature."""
+        spread = self._expectation(2) - self._expectation(1) ** 2
+        return spread.clamp_min(0).to(torch.get_default_dtype())
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The mean, which TensorDict modules return under ``ExplorationType.DETERMINISTIC``."""
+        return self.mean
+
+
+class MixtureDensityNetwork(nn.Module):
+    """Summary statistics to mixture parameters in standardised coordinates.
+
+    Args:
+        features: Of the summaries.
+        parameters: Number D of physics parameters.
+        components: Number K of mixture components.
+        covariance: ``"diagonal"`` as in the paper, or ``"full"``.
+        reach: Means stay within so many prior deviations: inside the box if there is one, because
+            the mass of a correlated component far outside cannot be integrated faithfully.
+    """
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(
+        self,
+        features: Features,
+        parameters: int,
+        *,
+        components: int,
+        covariance: Covariance,
+        reach: float,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        if covariance not in {"diagonal", "full"}:
+            raise ValueError(
+                message("a covariance structure", covariance, available=["diagonal", "full"])
+            )
+        self.features = features
+        self.parameters_, self.components, self.covariance = parameters, components, covariance
+        self.reach = reach
+        lower = parameters * (parameters - 1) // 2 if covariance == "full" else 0
+        self.sizes = [components, components * parameters, components * parameters]
+        self.sizes.append(components * lower)
+        with torch.random.fork_rng(devices=[]):
+            torch.random.default_generator.manual_seed(seed)
+            self.head = nn.Linear(features.out_features, sum(self.sizes))
+        start = torch.quasirandom.SobolEngine(parameters, scramble=True, seed=seed)
+        with torch.no_grad():
+            self.head.weight.mul_(0.1)
+            self.head.bias.zero_()
+            loc = self.head.bias.split(self.sizes)[1]
+            loc.copy_((1.2 * (2 * start.draw(components) - 1)).flatten())
+        self.register_buffer("shift", torch.zeros(features.dim))
+        self.register_buffer("scale", torch.ones(features.dim))
+
+    def standardize_inputs(self, summaries: Tensor) -> None:
+        """Set the input scaling from training summaries ``(N, L)``; constant ones are ignored."""
+        mean, sd = summaries.mean(0), summaries.std(0)
+        constant = sd <= 1e-6 * (1e-12 + summaries.abs().amax(0))
+        self.shift.copy_(mean)
+        self.scale.copy_(torch.where(constant, torch.inf, sd))
+
+    def scaled(self, summary: Tensor) -> Tensor:
+        """Return the standardised inputs of the features, with heavy tails compressed."""
+        if summary.shape[-1:] != self.shift.shape:
+            raise ValueError(
+                message(f"summaries of shape (*, {len(self.shift)})", tuple(summary.shape))
+            )
+        return ((summary - self.shift) / self.scale).asinh()
+
+    def forward(self, summary: Tensor) -> Mixture:
+        """Return the mixture for summaries ``(*, L)``."""
+        raw = self.head(self.features(self.scaled(summary)))
+        logits, loc, diagonal, lower = raw.split(self.sizes, -1)
+        shape = (*summary.shape[:-1], self.components, self.parameters_)
+        loc = self.reach * torch.tanh(loc.reshape(shape) / self.reach)
+        deviation = melu(diagonal.reshape(shape)).sqrt()
+        deviation = WIDEST * torch.tanh(deviation / WIDEST)
+        rows = torch.diag_embed(torch.ones_like(deviation))
+        if self.covariance == "full" and self.parameters_ > 1:
+            below = torch.tril_indices(self.parameters_, self.parameters_, -1)
+            slope = lower.reshape(*shape[:-1], -1)
+            rows[..., below[0], below[1]] = STEEPEST * torch.tanh(slope / STEEPEST)
+            # unit rows: the network sets marginal deviations and correlations separately
+            rows = rows / rows.norm(dim=-1, keepdim=True)
+        return Mixture(logits, loc, deviation.unsqueeze(-1) * rows)
+
+
+class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
+    """The amortised posterior as a TensorDict module: reads ``"summary"``, writes ``"theta"``.
+
+    ``posterior.get_dist(td)`` returns the distribution for every summary in ``td``;
+    ``posterior.condition(real)`` the one posterior for all the real trajectories together, which
+    can be assigned to a randomizer's ``source``.
+
+    Args:
+        prior: Names, units, support and scaling of the parameters.
+        summary_dim: Size L of the summary statistics.
+        components: Number K of mixture components.
+        covariance: ``"full"``, or ``"diagonal"`` as in the paper.
+        features: ``"neural"``, ``"fourier"``, or a ``Features`` module.
+        in_key: Key of the summaries, shape ``(*, L)``.
+        out_key: Key of the parameters, shape ``(*, D)``.
+        seed: Of the initial weights and frequencies.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_bayessim.inference.priors import BoxPrior
+        >>> prior = BoxPrior({"mass": (2.0, 6.0), "friction": (0.5, 2.0)})
+        >>> posterior = MixtureDensityPosterior(prior, 10)
+        >>> data = posterior(TensorDict({"summary": torch.zeros(32, 10)}, [32]))
+        >>> data["theta"].shape, data["theta_log_prob"].shape
+        (torch.Size([32, 2]), torch.Size([32]))
+        >>> posterior.condition(torch.zeros(3, 10)).sample((5,)).shape
+        torch.Size([5, 2])
+    """
+
+    def __init__(
+        self,
+        prior: Prior,
+        summary_dim: int,
+        *,
+        components: int = 6,
+        covariance: Covariance = "full",
+        features: Literal["neural", "fourier"] | Features = "neural",
+        in_key: NestedKey = "summary",
+        out_key: NestedKey = "theta",
+        seed: int = 0,
+    ) -> None:
+        if isinstance(features, str) and features not in MAPS:
+            raise ValueError(message("the name of a feature map", features, available=MAPS))
+        network = MixtureDensityNetwork(
+            features if isinstance(features, Features) else MAPS[features](summary_dim, seed=seed),
+            len(prior.names),
+            components=components,
+            covariance=covariance,
+            reach=8.0 if prior.box is None else prior.box[1].max().item(),
+            seed=seed,
+        )
+        keys: dict[str, NestedKey] = {name: ("posterior", name) for name in Mixture._fields}
+        diagonal = covariance == "diagonal"
+        modules = [
+            TensorDictModule(network, in_keys=[in_key], out_keys=list(keys.values())),
+            ProbabilisticTensorDictModule(
+                in_keys=keys,
+                out_keys=[out_key],
+                distribution_class=partial(  # pyright: ignore[reportArgumentType]
+                    _distribution, prior=prior, diagonal=diagonal, points=TRAINING_POINTS
+                ),
+                return_log_prob=True,
+                log_prob_key=f"{out_key}_log_prob" if isinstance(out_key, str) else None,
+            ),
+        ]
+        super().__init__(*modules)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        self.prior = prior
+
+    @property
+    def network(self) -> MixtureDensityNetwork:
+        """The network from summaries to mixture parameters."""
+        return self.module[0].module  # pyright: ignore[reportReturnType]
+
+    def distribution(self, summary: Tensor) -> PhysicsPosterior:
+        """Return one posterior per summary, for summaries ``(*, L)``."""
+        return _distribution(
+            **self.network(summary)._asdict(),
+            prior=self.prior,
+            diagonal=self.network.covariance == "diagonal",
+        )
+
+    @torch.no_grad()
+    def condition(self, summaries: Tensor, *, pooling: Pooling = "product") -> PhysicsPosterior:
+        r"""Return the posterior given the summaries of n real trajectories together.
+
+        Args:
+            summaries: Shape ``(n, L)`` or ``(L,)``; trajectories may differ in length.
+            pooling: ``"product"``: :math:`\prod_i q(\theta \mid x_i) / p(\theta)^{n-1}`, the
+                posterior of independent trajectories, so that more data sharpen it;
+                ``"mean"``: the posterior of the averaged summary, as the paper does, which does
+                not become sharper with n.
+
+        Raises:
+            ValueError: For no summaries, wrong shapes, NaN or infinite statistics.
+        """
+        summaries = torch.atleast_2d(torch.as_tensor(summaries))
+        if len(summaries) == 0 or summaries.ndim != 2:
+            raise ValueError(
+                message(
+                    f"summaries of n >= 1 real trajectories, shape (n, {len(self.network.shift)})",
+                    tuple(summaries.shape),
+                )
+            )
+        bad = ~summaries.isfinite().all(-1)
+        if bad.any():
+            raise ValueError(
+                message(
+                    "finite summary statistics of the real trajectories",
+                    f"NaN or infinity in rows {bad.nonzero().flatten().tolist()}",
+                    hint="drop these trajectories, or repair their logs",
+                )
+            )
+        if pooling == "mean":
+            return self.distribution(summaries.mean(0))
+        if pooling != "product":
+            raise ValueError(message("a pooling", pooling, available=["product", "mean"]))
+        each = self.distribution(summaries).mixture
+        return PhysicsPosterior(pool(each, bounded=self.prior.box is not None), self.prior)
+
+    def extra_repr(self) -> str:
+        """Show the prior."""
+        return repr(self.prior)
+
+
+def _distribution(
+    logits: Tensor,
+    loc: Tensor,
+    scale_tril: Tensor,
+    *,
+    prior: Prior,
+    diagonal: bool,
+    points: int = POINTS,
+) -> PhysicsPosterior:
+    mixture = TruncatedGaussianMixture(
+        logits, loc, scale_tril, prior.box, diagonal=diagonal, points=points
+    )
+    return PhysicsPosterior(mixture, prior)

@@ -1,0 +1,375 @@
+r"""What is believed about the physics before any data: named, bounded, in units.
+
+Two coordinates appear throughout the package. *Parameters* :math:`\theta` are in the units of the
+simulator. *Standardised coordinates* :math:`z` have prior mean 0 and prior variance 1 in every
+direction, and are where networks and mixtures work:
+
+.. math::
+    z = (u - \operatorname{E}[u]) / \operatorname{sd}[u], \qquad
+    u_d = \theta_d \text{ or } \log \theta_d .
+
+A prior is a torch :class:`~torch.distributions.Distribution` with event shape ``(D,)``.
+"""
+
+from __future__ import annotations
+
+__all__ = ["BoxPrior", "GaussianPrior", "Prior", "Standardization"]
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import torch
+from torch import Size, Tensor
+from torch.distributions import Distribution, constraints
+from torch.distributions.transforms import (
+    AffineTransform,
+    ComposeTransform,
+    SigmoidTransform,
+    Transform,
+)
+
+from ..errors import message
+
+Pairs = Mapping[str, tuple[float, float]] | Sequence[tuple[str, tuple[float, float]]]
+
+
+def _as_list(pairs: Pairs) -> list[tuple[str, tuple[float, float]]]:
+    return list(pairs.items()) if isinstance(pairs, Mapping) else list(pairs)
+
+
+class Standardization(Transform):
+    r"""The bijection :math:`z \mapsto \theta`: :math:`u = m + S z`, then exp where logarithmic.
+
+    Args:
+        mean: :math:`m`, shape ``(D,)``.
+        scale_tril: :math:`S`, lower triangular, shape ``(D, D)``.
+        log: Which parameters are logarithmic, boolean, shape ``(D,)``.
+    """
+
+    domain = constraints.real_vector
+    codomain = constraints.real_vector
+    bijective = True
+
+    def __init__(self, mean: Tensor, scale_tril: Tensor, log: Tensor) -> None:
+        super().__init__()
+        self.mean, self.scale_tril, self.log = mean, scale_tril, log
+
+    def _call(self, x: Tensor) -> Tensor:
+        u = self.mean.to(x.dtype) + x @ self.scale_tril.to(x.dtype).mT
+        return torch.where(self.log, u.exp(), u) if self.log.any() else u
+
+    def _inverse(self, y: Tensor) -> Tensor:
+        u = y
+        if self.log.any():
+            positive = torch.where(self.log, y.clamp_min(torch.finfo(y.dtype).tiny), 1.0)
+            u = torch.where(self.log, positive.log(), y)
+        centred = (u - self.mean.to(y.dtype)).unsqueeze(-1)
+        scale = self.scale_tril.to(y.dtype)
+        return torch.linalg.solve_triangular(scale, centred, upper=False).squeeze(-1)
+
+    def log_abs_det_jacobian(self, x: Tensor, y: Tensor) -> Tensor:
+        r"""Return :math:`\log |\partial\theta / \partial z|`, shape ``(*)``."""
+        volume = self.scale_tril.diagonal().log().sum().to(x.dtype)
+        if not self.log.any():
+            return volume.expand(x.shape[:-1])
+        return volume + torch.where(self.log, y, torch.ones_like(y)).log().sum(-1)
+
+
+class Prior(Distribution):
+    r"""A distribution over named parameters, with a standardisation and a bijection to R^D.
+
+    Attributes:
+        names: The parameters' names, in the order of the columns of ``theta``.
+        units: One unit per parameter, ``""`` where none was given.
+        standardization: The transform :math:`z \mapsto \theta`.
+        bijection: A transform from all of R^D onto the support.
+        box: The support in standardised coordinates, ``(low, high)``; ``None`` if all of R^D.
+    """
+
+    arg_constraints: ClassVar[dict] = {}
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    standardization: Standardization
+    bijection: Transform
+    box: tuple[Tensor, Tensor] | None
+
+    def _name(self, names: Sequence[str], units: Mapping[str, str] | None) -> None:
+        units = units or {}
+        unknown = [name for name in units if name not in names]
+        if unknown:
+            raise ValueError(message("units of declared parameters", unknown[0], available=names))
+        self.names = tuple(names)
+        self.units = tuple(units.get(name, "") for name in names)
+        super().__init__(Size(), Size((len(names),)), validate_args=False)
+
+    def standardize(self, theta: Tensor) -> Tensor:
+        """Return the standardised coordinates of parameters, shape ``(*, D)``."""
+        self._check_event(theta)
+        return self.standardization._inverse(theta)
+
+    def unstandardize(self, z: Tensor) -> Tensor:
+        """Return the parameters at standardised coordinates, shape ``(*, D)``."""
+        return self.standardization._call(z)
+
+    def _check_event(self, theta: Tensor) -> None:
+        if theta.shape[-1:] != self.event_shape:
+            raise ValueError(
+                message(
+                    f"parameters of shape (*, {len(self.names)}), one column for each of "
+                    f"{', '.join(self.names)}",
+                    tuple(theta.shape),
+                )
+            )
+
+
+class BoxPrior(Prior):
+    r"""Independent uniform (or log-uniform) parameters on a box.
+
+    .. math::
+        \log p(\theta) = -\sum_d \log(h_d - l_d)
+        \quad\text{or}\quad -\sum_d \log\theta_d + \log\log(h_d / l_d) \text{ if logarithmic,}
+
+    and :math:`-\infty` outside.
+
+    Args:
+        bounds: ``{name: (low, high)}`` in the parameters' units.
+        log: Names of the parameters that are uniform in their logarithm.
+        units: ``{name: unit}``, for reports and pictures.
+
+    Raises:
+        ValueError: For no parameters, duplicate names, reversed, equal, infinite or NaN bounds,
+            and a logarithmic parameter whose lower bound is not positive.
+
+    Example:
+        >>> prior = BoxPrior({"mass": (2.0, 6.0), "damping": (0.01, 1.0)}, log=["damping"],
+        ...                  units={"mass": "kg", "damping": "N m s"})
+        >>> theta = prior.sample((512,))
+        >>> theta.shape, bool(prior.contains(theta).all())
+        (torch.Size([512, 2]), True)
+        >>> prior.log_prob(torch.tensor([[4.0, 0.1], [9.0, 0.1]]))
+        tensor([-0.6109,    -inf])
+    """
+
+    def __init__(
+        self,
+        bounds: Pairs,
+        *,
+        log: Sequence[str] = (),
+        units: Mapping[str, str] | None = None,
+    ) -> None:
+        pairs = _as_list(bounds)
+        names = [name for name, _ in pairs]
+        _check_bounds(pairs, names, log)
+        self.low = torch.tensor([float(low) for _, (low, _) in pairs])
+        self.high = torch.tensor([float(high) for _, (_, high) in pairs])
+        self.log = torch.tensor([name in log for name in names])
+        low, high = self._u(self.low.double()), self._u(self.high.double())
+        half = (high - low) / 2
+        self.standardization = Standardization(
+            low + half, torch.diag(half / math.sqrt(3.0)), self.log
+        )
+        edge = math.sqrt(3.0) * torch.ones(len(names), dtype=torch.float64)
+        self.box = (-edge, edge)
+        self.bijection = ComposeTransform(
+            [
+                SigmoidTransform(),
+                AffineTransform(-math.sqrt(3.0), 2 * math.sqrt(3.0), event_dim=1),
+                self.standardization,
+            ]
+        )
+        self._name(names, units)
+
+    def _u(self, theta: Tensor) -> Tensor:
+        return torch.where(self.log, torch.where(self.log, theta, 1.0).log(), theta)
+
+    @property
+    def support(self) -> constraints.Constraint:  # noqa: D102 (documented by torch)
+        return constraints.independent(constraints.interval(self.low, self.high), 1)
+
+    @property
+    def mean(self) -> Tensor:
+        """The prior means, shape ``(D,)``."""
+        width = torch.where(self.log, (self.high / self.low).log(), 1.0)
+        return torch.where(self.log, (self.high - self.low) / width, (self.low + self.high) / 2)
+
+    @property
+    def variance(self) -> Tensor:
+        """The prior variances, shape ``(D,)``."""
+        width = torch.where(self.log, (self.high / self.low).log(), 1.0)
+        square = (self.high**2 - self.low**2) / (2 * width)
+        return torch.where(self.log, square - self.mean**2, (self.high - self.low) ** 2 / 12)
+
+    def sample(
+        self, sample_shape: Sequence[int] = (), *, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Return draws of shape ``(*sample_shape, D)``, from ``generator`` if one is given."""
+        unit = torch.rand(*sample_shape, *self.event_shape, generator=generator)
+        low, high = self._u(self.low), self._u(self.high)
+        u = low + unit * (high - low)
+        theta = torch.where(self.log, u.exp(), u)
+        # exp(log(high)) may exceed high by one rounding; the bound itself is in the support
+        return torch.minimum(torch.maximum(theta, self.low), self.high)
+
+    def contains(self, theta: Tensor) -> Tensor:
+        """Return which parameters lie in the box (up to rounding), boolean, shape ``(*)``."""
+        self._check_event(theta)
+        slack = 1e-6 * (self.high - self.low)
+        return ((theta >= self.low - slack) & (theta <= self.high + slack)).all(-1)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log-density, ``-inf`` outside the box, shape ``(*)``."""
+        inside = self.contains(value)
+        low, high = self._u(self.low), self._u(self.high)
+        safe = torch.where(self.log & (value > 0), value, torch.ones_like(value))
+        density = -((high - low).log() + safe.log()).sum(-1)
+        return torch.where(inside, density, -torch.inf)
+
+    def __repr__(self) -> str:
+        rows = zip(self.names, self.low.tolist(), self.high.tolist(), self.units, strict=True)
+        body = ", ".join(f"{n}: [{lo:.4g}, {hi:.4g}] {u}".rstrip() for n, lo, hi, u in rows)
+        return f"BoxPrior({body})"
+
+
+def _check_bounds(
+    pairs: Sequence[tuple[str, tuple[float, float]]], names: Sequence[str], log: Sequence[str]
+) -> None:
+    if not pairs:
+        raise ValueError(message("at least one named parameter", "an empty prior"))
+    _check_unique(names)
+    for name, (low, high) in pairs:
+        if not (math.isfinite(low) and math.isfinite(high)):
+            raise ValueError(
+                message(
+                    f"finite bounds for {name!r} (a uniform density needs a finite box)",
+                    (low, high),
+                    hint="finite bounds, or GaussianPrior for an unbounded parameter",
+                )
+            )
+        if low >= high:
+            raise ValueError(
+                message(f"low < high for {name!r}", (low, high), hint=f"({high}, {low})")
+            )
+        if name in log and low <= 0:
+            raise ValueError(
+                message(
+                    f"a positive lower bound for the logarithmic parameter {name!r}",
+                    (low, high),
+                    hint="a small positive lower bound, or drop it from log=",
+                )
+            )
+    for name in log:
+        if name not in names:
+            raise ValueError(message("log= to name declared parameters", name, available=names))
+
+
+def _check_unique(names: Sequence[str]) -> None:
+    duplicates = sorted({name for name in names if list(names).count(name) > 1})
+    if duplicates:
+        raise ValueError(message("every parameter once", f"{duplicates[0]} twice"))
+
+
+class GaussianPrior(Prior):
+    r"""A Gaussian over parameters, :math:`p(\theta) = N(\theta; m, \Sigma)`, unbounded.
+
+    Args:
+        moments: ``{name: (mean, standard deviation)}`` in the parameters' units.
+        correlation: Correlation matrix, shape ``(D, D)``; independent if omitted.
+        units: ``{name: unit}``, for reports and pictures.
+
+    Raises:
+        ValueError: For no parameters, duplicate names, NaN or infinite moments, standard
+            deviations that are not positive, and a correlation that is not positive definite.
+
+    Example:
+        >>> prior = GaussianPrior({"mass": (4.0, 0.5), "offset": (0.0, 0.1)})
+        >>> prior.sample((3,)).shape, prior.mean
+        (torch.Size([3, 2]), tensor([4., 0.]))
+    """
+
+    def __init__(
+        self,
+        moments: Pairs,
+        *,
+        correlation: Tensor | None = None,
+        units: Mapping[str, str] | None = None,
+    ) -> None:
+        pairs = _as_list(moments)
+        names = [name for name, _ in pairs]
+        if not pairs:
+            raise ValueError(message("at least one named parameter", "an empty prior"))
+        _check_unique(names)
+        for name, (mean, sd) in pairs:
+            if not (math.isfinite(mean) and math.isfinite(sd) and sd > 0):
+                raise ValueError(
+                    message(f"a finite mean and a positive deviation for {name!r}", (mean, sd))
+                )
+        mean = torch.tensor([float(m) for _, (m, _) in pairs], dtype=torch.float64)
+        sd = torch.tensor([float(s) for _, (_, s) in pairs], dtype=torch.float64)
+        self.standardization = Standardization(
+            mean,
+            sd[:, None] * _correlation_tril(correlation, len(names)),
+            torch.zeros(len(names), dtype=torch.bool),
+        )
+        self.box = None
+        self.bijection = self.standardization
+        self._name(names, units)
+
+    @property
+    def support(self) -> constraints.Constraint:  # noqa: D102 (documented by torch)
+        return constraints.real_vector
+
+    @property
+    def mean(self) -> Tensor:
+        """The prior means, shape ``(D,)``."""
+        return self.standardization.mean.to(torch.get_default_dtype())
+
+    @property
+    def variance(self) -> Tensor:
+        """The prior variances, shape ``(D,)``."""
+        scale = self.standardization.scale_tril.to(torch.get_default_dtype())
+        return scale.square().sum(-1)
+
+    def sample(
+        self, sample_shape: Sequence[int] = (), *, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Return draws of shape ``(*sample_shape, D)``, from ``generator`` if one is given."""
+        return self.unstandardize(
+            torch.randn(*sample_shape, *self.event_shape, generator=generator)
+        )
+
+    def contains(self, theta: Tensor) -> Tensor:
+        """Return which parameters are finite: the support is all of R^D; shape ``(*)``."""
+        self._check_event(theta)
+        return theta.isfinite().all(-1)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log-density, shape ``(*)``."""
+        z = self.standardize(value)
+        base = -0.5 * (z.square() + math.log(2 * math.pi)).sum(-1)
+        return base - self.standardization.log_abs_det_jacobian(z, value)
+
+    def __repr__(self) -> str:
+        rows = zip(
+            self.names, self.mean.tolist(), self.variance.sqrt().tolist(), self.units, strict=True
+        )
+        body = ", ".join(f"{n}: {m:.4g} ± {s:.4g} {u}".rstrip() for n, m, s, u in rows)
+        return f"GaussianPrior({body})"
+
+
+def _correlation_tril(correlation: Tensor | None, size: int) -> Tensor:
+    if correlation is None:
+        return torch.eye(size, dtype=torch.float64)
+    correlation = torch.as_tensor(correlation, dtype=torch.float64)
+    ones = torch.ones(size, dtype=torch.float64)
+    if correlation.shape != (size, size) or not torch.allclose(correlation.diagonal(), ones):
+        raise ValueError(
+            message(
+                f"a correlation matrix of shape ({size}, {size}) with unit diagonal",
+                tuple(correlation.shape),
+            )
+        )
+    tril, failed = torch.linalg.cholesky_ex(correlation)
+    if failed:
+        raise ValueError(message("a positive definite correlation matrix", correlation.tolist()))
+    return tril
