@@ -1,0 +1,242 @@
+r"""Summary statistics of trajectories.
+
+A summary is a function of states :math:`s_t`, actions :math:`a_t`, next states :math:`s_{t+1}` and
+a mask, of shapes ``(*, T, D)``, ``(*, T, A)``, ``(*, T, D)`` and ``(*, T)``, with values of shape
+``(*, L)``. Differences are :math:`\tau_t = s_{t+1} - s_t`, aligned with the action that caused
+them. Sums run over the steps in the mask and are divided by their number, so a summary does not
+encode the length of an episode unless it is asked to (:func:`duration`). Steps outside the mask
+are never read.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "Summary",
+    "SummaryStatistics",
+    "autocorrelation",
+    "cross_correlation",
+    "differences",
+    "duration",
+    "encode_actions",
+    "linear_dynamics",
+    "moments",
+    "waypoints",
+]
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from .errors import message
+from .trajectories import first_trajectories
+
+Summary = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+
+
+def encode_actions(action: Tensor) -> Tensor:
+    """Return actions as floats: one-hot of two choices as -1 and +1, others unchanged.
+
+    A discrete action coded 0 and 1 would make choice 0 invisible to every product.
+
+    Example:
+        >>> encode_actions(torch.tensor([[1, 0], [0, 1]])).flatten()
+        tensor([-1.,  1.])
+    """
+    if not action.is_floating_point() and action.shape[-1] == 2:
+        return 2.0 * action[..., 1:].float() - 1.0
+    return action.float()
+
+
+def differences(state: Tensor, next_state: Tensor, angles: Sequence[int] = ()) -> Tensor:
+    r"""Return :math:`\tau_t`, wrapped to :math:`[-\pi, \pi)` in the columns ``angles``."""
+    tau = next_state - state
+    if angles:
+        wrapped = torch.remainder(tau[..., list(angles)] + math.pi, 2 * math.pi) - math.pi
+        tau = tau.index_copy(-1, torch.as_tensor(list(angles)), wrapped)
+    return tau
+
+
+def _mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean over time, ``(*, T, F)`` to ``(*, F)``."""
+    count = mask.sum(-1, keepdim=True).clamp_min(1)
+    return torch.where(mask.unsqueeze(-1), values, 0.0).sum(-2) / count
+
+
+def cross_correlation(state: Tensor, action: Tensor, next_state: Tensor, mask: Tensor) -> Tensor:
+    r"""The BayesSim paper's statistics, L = D A + 2 D.
+
+    .. math::
+        \psi = \big(\{\langle\tau_i, a_j\rangle\}_{i=1..D, j=1..A},\;
+        \operatorname{E}[\tau],\; \operatorname{Var}[\tau]\big)
+
+    (Ramos et al., 2019, arXiv:1906.01728, eq. 22), with the inner product divided by the number of
+    steps and the variance unbiased. The paper sums without dividing, which makes the statistics of
+    an environment that ends early mostly a measure of length.
+
+    Example:
+        >>> s = torch.tensor([[0.0], [1.0], [3.0]])
+        >>> cross_correlation(s[:2], torch.tensor([[1.0], [-1.0]]), s[1:], torch.ones(2).bool())
+        tensor([-0.5000,  1.5000,  0.5000])
+    """
+    tau = next_state - state
+    product = (tau.unsqueeze(-1) * action.unsqueeze(-2)).flatten(-2)
+    return torch.cat([_mean(product, mask), moments(state, action, next_state, mask)], -1)
+
+
+def moments(state: Tensor, action: Tensor, next_state: Tensor, mask: Tensor) -> Tensor:
+    """Mean and unbiased variance of the differences, L = 2 D."""
+    del action
+    tau = next_state - state
+    mean = _mean(tau, mask)
+    count = mask.sum(-1, keepdim=True)
+    centred = torch.where(mask.unsqueeze(-1), tau - mean.unsqueeze(-2), 0.0)
+    variance = centred.square().sum(-2) / (count - 1).clamp_min(1)
+    return torch.cat([mean, variance], -1)
+
+
+def duration(state: Tensor, action: Tensor, next_state: Tensor, mask: Tensor) -> Tensor:
+    """Logarithm of the number of steps, L = 1: when an episode ends is information too."""
+    del state, action, next_state
+    return mask.sum(-1, keepdim=True).clamp_min(1).float().log()
+
+
+def autocorrelation(*lags: int) -> Summary:
+    r"""Autocorrelations of the differences at each lag, and their variances; L = D (lags + 1).
+
+    :math:`\rho_k = \operatorname{E}[\tau_t \tau_{t+k}] / \operatorname{E}[\tau_t^2]`, over the
+    pairs of steps that both count. Frequencies and damping show here.
+
+    Raises:
+        ValueError: For no lags, or lags that are not positive.
+    """
+    if not lags or min(lags) < 1:
+        raise ValueError(message("positive lags", lags, hint="autocorrelation(1, 2, 4, 8)"))
+
+    def summary(state: Tensor, action: Tensor, next_state: Tensor, mask: Tensor) -> Tensor:
+        del action
+        tau = next_state - state
+        power = _mean(tau.square(), mask)
+        parts = [power.clamp_min(1e-20).log()]
+        for lag in lags:
+            if lag >= tau.shape[-2]:
+                parts.append(torch.zeros_like(power))
+                continue
+            both = mask[..., lag:] & mask[..., :-lag]
+            product = tau[..., lag:, :] * tau[..., :-lag, :]
+            parts.append(_mean(product, both) / power.clamp_min(1e-20))
+        return torch.cat(parts, -1)
+
+    return summary
+
+
+def waypoints(count: int) -> Summary:
+    """States at ``count`` moments spread evenly over each trajectory's own length; L = D count.
+
+    Raises:
+        ValueError: If ``count`` is not positive.
+    """
+    if count < 1:
+        raise ValueError(message("a positive number of waypoints", count))
+
+    def summary(state: Tensor, action: Tensor, next_state: Tensor, mask: Tensor) -> Tensor:
+        del state, action
+        length = mask.sum(-1, keepdim=True).clamp_min(1)
+        share = torch.arange(1, count + 1, device=mask.device) / count
+        index = (share * length).ceil().long().clamp_min(1) - 1
+        index = index.unsqueeze(-1).expand(*index.shape, next_state.shape[-1])
+        return next_state.gather(-2, index).flatten(-2)
+
+    return summary
+
+
+def linear_dynamics(state: Tensor, action: Tensor, next_state: Tensor, mask: Tensor) -> Tensor:
+    r"""Least-squares dynamics and what they leave, L = D (D + A + 1) + D.
+
+    The coefficients W of :math:`\tau_t \approx W [s_t, a_t, 1]` and the logarithm of each output's
+    residual variance. The coefficients depend on the physics and hardly on the policy, which makes
+    them sharper than correlations wherever the dynamics are smooth. A ridge of 1e-6 of each
+    regressor's own power keeps short trajectories and constant columns harmless.
+
+    Example:
+        >>> s = torch.cumsum(torch.randn(1, 65, 1), -2)
+        >>> a = s[:, 1:] - 0.9 * s[:, :-1]            # s' = 0.9 s + a
+        >>> mask = torch.ones(1, 64, dtype=torch.bool)
+        >>> linear_dynamics(s[:, :-1], a, s[:, 1:], mask)[0, :2].round(decimals=3)
+        tensor([-0.1000,  1.0000])
+    """
+    ones = torch.ones_like(state[..., :1])
+    keep = mask.unsqueeze(-1)
+    regressors = torch.where(keep, torch.cat([state, action, ones], -1), 0.0).double()
+    tau = torch.where(keep, next_state - state, 0.0).double()
+    count = mask.sum(-1).clamp_min(1)[..., None, None]
+    gram = regressors.mT @ regressors / count
+    power = gram.diagonal(dim1=-2, dim2=-1)
+    gram = gram + torch.diag_embed(1e-6 * power + 1e-12)
+    solution, _ = torch.linalg.solve_ex(gram, regressors.mT @ tau / count)
+    residual = (tau - regressors @ solution).square().sum(-2) / count.squeeze(-1)
+    scale = tau.square().sum(-2) / count.squeeze(-1)
+    left = ((residual + 1e-12) / (scale + 1e-12)).log()
+    return torch.cat([solution.mT.flatten(-2), left], -1).to(state.dtype)
+
+
+class SummaryStatistics(TensorDictModuleBase):
+    """Summaries of a batch of trajectories: a TensorDict module, and a collector's ``postproc``.
+
+    Turns a batch of size ``[*, T]`` into one of size ``[*]`` with the summary and, where present,
+    the parameters of each row's first trajectory.
+
+    Args:
+        *functions: Summaries; their values are concatenated.
+        angles: Columns of the observation that are raw angles in radians.
+        observation_key: Key of the state.
+        action_key: Key of the action; one-hot actions are encoded by :func:`encode_actions`.
+        out_key: Key of the summary.
+
+    Raises:
+        ValueError: For no functions.
+
+    Example:
+        >>> from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
+        >>> statistics = SummaryStatistics(cross_correlation, duration)
+        >>> statistics(CartPoleEnv(8).rollout(50, break_when_any_done=False))["summary"].shape
+        torch.Size([8, 13])
+    """
+
+    def __init__(
+        self,
+        *functions: Summary,
+        angles: Sequence[int] = (),
+        observation_key: NestedKey = "observation",
+        action_key: NestedKey = "action",
+        out_key: NestedKey = "summary",
+    ) -> None:
+        super().__init__()
+        if not functions:
+            raise ValueError(message("at least one summary", "none", hint="cross_correlation"))
+        self.functions, self.angles = functions, tuple(angles)
+        self.observation_key, self.action_key = observation_key, action_key
+        self.in_keys = [observation_key, action_key, _next(observation_key), ("next", "done")]
+        self.out_keys = [out_key]
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return ``{"summary": (*, L)[, "theta": (*, D)]}`` of trajectories ``[*, T]``."""
+        if "mask" not in tensordict.keys():  # noqa: SIM118 (TensorDict iterates rows)
+            tensordict = first_trajectories(tensordict)
+        state, mask = tensordict.get(self.observation_key), tensordict.get("mask")
+        action = encode_actions(tensordict.get(self.action_key))
+        # angles are unwrapped through their wrapped differences, once, for every summary
+        tau = differences(state, tensordict.get(_next(self.observation_key)), self.angles)
+        parts = [function(state, action, state + tau, mask) for function in self.functions]
+        out = TensorDict({}, batch_size=tensordict.batch_size[:-1])
+        out.set(self.out_keys[0], torch.cat(parts, -1))
+        theta = tensordict.get("theta", None)
+        return out if theta is None else out.set("theta", theta[..., 0, :])
+
+
+def _next(key: NestedKey) -> NestedKey:
+    return ("next", key) if isinstance(key, str) else ("next", *key)
