@@ -1,0 +1,129 @@
+"""Keeping work: a file that is always whole, and that runs no code when it is read.
+
+`save` writes a temporary file beside the target, forces it to disk and renames it: whoever looks
+sees the old checkpoint or the new one, also after a crash or a power cut. `load` accepts tensors
+and plain values only, and checks the file before it trusts it.
+"""
+
+from __future__ import annotations
+
+__all__ = ["SCHEMA", "load", "save"]
+
+import io
+import os
+import pickle
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .errors import message
+
+SCHEMA = 1
+"""Version of the file's layout; a file with another one is refused."""
+
+_FORMAT = "torchrl_bayessim checkpoint"
+
+
+def save(path: str | os.PathLike[str], state: Mapping[str, Any]) -> None:
+    """Write ``state`` to ``path``, wholly or not at all. Missing folders are made.
+
+    Args:
+        path: The file; replaced if it exists.
+        state: Nested dicts, lists and tuples of tensors, numbers, strings, booleans and None.
+            Tensors are copied to the CPU, without their gradients.
+
+    Raises:
+        TypeError: A value of another type; the message says where. Nothing is written then.
+
+    Example:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp()) / "run" / "round.pt"
+        >>> save(file, {"round": 2, "weight": torch.ones(2)})
+        >>> load(file)
+        {'round': 2, 'weight': tensor([1., 1.])}
+    """
+    content = {"format": _FORMAT, "schema": SCHEMA, "state": _plain(state, "state")}
+    path = Path(path).absolute()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            torch.save(content, file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    _sync_folder(path.parent)
+
+
+def load(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the state that `save` wrote to ``path``, its tensors on the CPU.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is truncated, damaged, of another program or of another schema.
+    """
+    data = Path(path).read_bytes()
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            damaged = archive.testzip()  # torch.load does not verify the checksums
+        if damaged is not None:
+            raise zipfile.BadZipFile(damaged)
+        content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except (zipfile.BadZipFile, pickle.UnpicklingError, RuntimeError, EOFError, ValueError) as e:
+        raise ValueError(
+            message(
+                "a whole checkpoint written by this package",
+                f"{path}: {type(e).__name__}, {len(data)} bytes",
+                hint="an earlier checkpoint of the same run",
+            )
+        ) from e
+    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+        raise ValueError(message("a checkpoint written by this package", str(path)))
+    if content.get("schema") != SCHEMA:
+        raise ValueError(
+            message(
+                f"a checkpoint of schema {SCHEMA}",
+                content.get("schema"),
+                hint="the version of the package that wrote it",
+            )
+        )
+    return content["state"]
+
+
+def _plain(value: Any, where: str) -> Any:
+    """Return ``value`` with its tensors detached and copied; raise for what is not plain."""
+    if isinstance(value, Tensor):
+        return value.detach().to("cpu", copy=True).contiguous()
+    if isinstance(value, Mapping):
+        for key in value:
+            if type(key) not in (str, int):
+                raise TypeError(message(f"keys of {where} to be str or int", key))
+        return {key: _plain(item, f"{where}[{key!r}]") for key, item in value.items()}
+    if type(value) in (list, tuple):
+        return type(value)(_plain(item, f"{where}[{i}]") for i, item in enumerate(value))
+    if value is None or type(value) in (bool, int, float, str, bytes):
+        return value
+    raise TypeError(
+        message(
+            f"{where} to be a tensor or a plain value",
+            type(value).__name__,
+            hint="its state_dict(), or a tensor, number or string made from it",
+        )
+    )
+
+
+def _sync_folder(folder: Path) -> None:
+    """Force the rename itself to disk, where the system lets folders be opened."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
