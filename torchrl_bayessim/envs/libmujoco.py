@@ -11,9 +11,11 @@ __all__ = [
     "compiled",
     "doubles",
     "integers",
+    "mj_com_pos",
     "mj_forward",
     "mj_get_state",
     "mj_jac_site",
+    "mj_kinematics",
     "mj_reset",
     "mj_rne",
     "mj_set_const",
@@ -48,6 +50,8 @@ def _external(name: str, *arguments: types.Type) -> types.ExternalFunction:
 
 mj_step = _external("mj_step", _pointer, _pointer)
 mj_forward = _external("mj_forward", _pointer, _pointer)
+mj_kinematics = _external("mj_kinematics", _pointer, _pointer)
+mj_com_pos = _external("mj_comPos", _pointer, _pointer)
 mj_reset = _external("mj_resetData", _pointer, _pointer)
 mj_set_const = _external("mj_setConst", _pointer, _pointer)
 mj_rne = _external("mj_rnePostConstraint", _pointer, _pointer)

@@ -34,13 +34,27 @@ _DERIVED = (
     "stat.meaninertia",
 )
 # Scalars of mjOption and mjStatistic have no array in Python: their distance, in numbers, from
-# one that has (mjmodel.h), checked against the value that Python reads.
+# one that has (the order of the structs in mjmodel.h).
 _SCALARS = {
     "opt.timestep": ("opt.gravity", -7),
     "opt.impratio": ("opt.gravity", -6),
+    "opt.tolerance": ("opt.gravity", -5),
+    "opt.ls_tolerance": ("opt.gravity", -4),
+    "opt.noslip_tolerance": ("opt.gravity", -3),
+    "opt.ccd_tolerance": ("opt.gravity", -2),
     "opt.density": ("opt.gravity", 9),
     "opt.viscosity": ("opt.gravity", 10),
+    "opt.o_margin": ("opt.gravity", 11),
     "stat.meaninertia": ("stat.center", -4),
+}
+# Where a frame coincides with its body's (or inertial) frame MuJoCo copies it and ignores these.
+_FRAMES = {
+    "body_ipos": "body_sameframe",
+    "body_iquat": "body_sameframe",
+    "geom_pos": "geom_sameframe",
+    "geom_quat": "geom_sameframe",
+    "site_pos": "site_sameframe",
+    "site_quat": "site_sameframe",
 }
 
 
@@ -160,18 +174,27 @@ class ModelBatch:
         native.refresh(model._address, data._address, selected, self.table, *self._derived)
 
     def addresses(self, model: mujoco.MjModel) -> NDArray[np.int64]:
-        """Return where the columns of the table belong in a copy of the model, shape ``(K,)``."""
+        """Return where the columns of the table belong in a copy of the model, shape ``(K,)``.
+
+        The copy is told not to take short cuts that hold for the nominal values only.
+        """
+        for field, indices in self._columns:
+            if field in _FRAMES:
+                getattr(model, _FRAMES[field])[indices[0]] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         return np.array([_address(model, *key) for key in self._columns], dtype=np.int64)
 
     def copy_of(self, row: int) -> mujoco.MjModel:
         """Return a model with the physics of environment ``row``, for use outside the batch."""
         model = copy.copy(self.model)
-        addresses = self.addresses(model)
-        native.override(addresses, self.table, row)
+        native.override(self.addresses(model), self.table, row)
         return model
 
     def _add(self, field: str, indices: tuple[int, ...]) -> int:
         value = self._nominal(field, indices)
+        if field in ("body_ipos", "body_iquat") and self.model.body_simple[indices[0]] == 1:
+            hint = "give the body an inertial frame off its origin in the MJCF"
+            expected = "a body whose centre of mass is not at its origin, to move it"
+            raise PhysicsError(message(expected, self.model.body(indices[0]).name, hint=hint))
         column = np.full((self.num_envs, 1), value)
         self.table = np.concatenate([self.table, column], axis=1)
         self._columns[field, indices] = len(self._columns)

@@ -67,7 +67,7 @@ class BatchedMujocoEnv(EnvBase):
     ) -> None:
         if num_envs < 1:
             raise ValueError(message("at least one environment", num_envs))
-        super().__init__(device="cpu", batch_size=torch.Size([num_envs]))
+        super().__init__(batch_size=torch.Size([num_envs]))
         self.task = known_task(task) if isinstance(task, str) else task
         self.num_envs = num_envs
         self.time_limit = time_limit or self.task.time_limit
@@ -87,6 +87,7 @@ class BatchedMujocoEnv(EnvBase):
         size = num_envs, 1, self.stepper.output_size
         self._outputs = [np.zeros(size), np.zeros(size)]
         self._start(np.arange(num_envs))
+        self._episodes[:] = 0
         self._readings = [self._read(outputs[:, 0]) for outputs in self._outputs]
         self._make_specs()
 

@@ -34,9 +34,11 @@ from .libmujoco import (
     compiled,
     doubles,
     integers,
+    mj_com_pos,
     mj_forward,
     mj_get_state,
     mj_jac_site,
+    mj_kinematics,
     mj_reset,
     mj_rne,
     mj_set_const,
@@ -152,7 +154,8 @@ def _control_step(thread, drive, substeps):
         qpos = doubles(thread[_QPOS])
         for j in pinned:
             qpos[j] = 0.0
-        mj_forward(m, d)
+        mj_kinematics(m, d)
+        mj_com_pos(m, d)
     if contact_forces:
         mj_rne(m, d)
     return 0

@@ -52,8 +52,8 @@ class Drive:
     Attributes:
         relative: Actuators whose control is added to the position of their joint.
         weld: The body that the mocap body drags.
-        pinned: Joints whose position is set to zero after each control step, which is followed by
-            an ``mj_forward``.
+        pinned: Joints whose position is set to zero after each control step; the places of bodies
+            and sites, but no forces, are then evaluated anew.
         contact_forces: Compute ``cfrc_ext`` after each control step (``mj_rnePostConstraint``).
     """
 
@@ -75,11 +75,19 @@ class _Worker:
         self.owned = np.array(
             [self.model._address, self.data._address, warning, *arrays], dtype=np.int64
         )
-        read = [getattr(self.data, name) for name in outputs]
+        read = [_array(self.data, name) for name in outputs]
         self.blocks = np.array(
             [(array.ctypes.data, array.size) for array in read], dtype=np.int64
         ).reshape(-1, 2)
         self.addresses = np.empty(0, dtype=np.int64)
+
+
+def _array(data: mujoco.MjData, name: str) -> NDArray[np.float64]:
+    array = getattr(data, name, None)
+    if not isinstance(array, np.ndarray) or array.dtype != np.float64:
+        names = [n for n in dir(data) if isinstance(getattr(data, n), np.ndarray)]
+        raise ValueError(message("an array of MjData that holds doubles", name, available=names))
+    return array
 
 
 class Stepper:

@@ -1,0 +1,228 @@
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_env_specs
+
+from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+from torchrl_bayessim.envs.task import Task, uniform_reset
+from torchrl_bayessim.envs.tasks.catalogue import known_task
+
+PENDULUM = """
+<mujoco>
+  <option timestep="0.01"/>
+  <worldbody>
+    <body name="pole">
+      <joint name="hinge" type="hinge" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="1"/>
+      <site name="tip" pos="0 0 -.5"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator>
+  <sensor><framepos objtype="site" objname="tip"/></sensor>
+</mujoco>
+"""
+
+
+def pendulum(**changes):
+    model = mujoco.MjModel.from_xml_string(PENDULUM)
+    task = Task(
+        model=model,
+        frame_skip=2,
+        outputs=("qpos", "qvel", "sensordata"),
+        observation=lambda now: torch.cat([now.qpos, now.qvel, now.sensordata], -1),
+        reward=lambda before, after, action: after.sensordata[..., 2] - action[..., 0].abs(),
+        reset=uniform_reset(model, 0.5),
+    )
+    return dataclasses.replace(task, **changes)
+
+
+def acted(env, td, scale=1.0):
+    td["action"] = scale * env.action_spec.rand()
+    return env.step(td)["next"]
+
+
+@pytest.mark.parametrize("name", ["Hopper-v5", "FetchReach-v4"])
+def test_specs_hold(name):
+    check_env_specs(BatchedMujocoEnv(name, 3))
+    check_env_specs(BatchedMujocoEnv(name, 1, dtype=torch.float64))
+
+
+def test_a_model_of_ones_own_with_sensors():
+    env = BatchedMujocoEnv(pendulum(), 2)
+    check_env_specs(env)
+    td = env.place({"qpos": torch.tensor([[0.0], [torch.pi / 2]]), "qvel": torch.zeros(2, 1)})
+    expected = torch.tensor([[0.0, 0.0, -0.5], [-0.5, 0.0, 0.0]])
+    torch.testing.assert_close(td["observation"][:, 2:], expected)
+
+
+def test_a_collector_resets_what_is_done_and_nothing_else():
+    env = TransformedEnv(
+        BatchedMujocoEnv("Hopper-v5", 4), Compose(StepCounter(max_steps=15), RewardSum())
+    )
+    collector = Collector(env, frames_per_batch=4 * 60, total_frames=4 * 60, trajs_per_batch=None)
+    (batch,) = list(collector)
+    done = batch["next", "done"][:, :-1, 0]
+    count = batch["next", "step_count"][..., 0]
+    assert done.any()
+    assert not done.all(0).all()
+    fresh = batch["step_count"][:, 1:, 0] == 0
+    assert (fresh == done).all()
+    carried = batch["observation"][:, 1:] == batch["next", "observation"][:, :-1]
+    assert carried.all(-1)[~done].all()
+    assert not carried.all(-1)[done].any()
+    assert count.max() <= 15
+
+
+def test_the_nth_episode_of_an_environment_depends_on_nothing_else():
+    one = BatchedMujocoEnv("Reacher-v5", 3, seed=5)
+    other = BatchedMujocoEnv("Reacher-v5", 8, seed=5)
+    first = one.reset()
+    second = one.reset()
+    assert (first["observation"] != second["observation"]).any(-1).all()
+    other.reset()
+    mask = torch.zeros(8, 1, dtype=torch.bool)
+    mask[1] = True
+    td = other.reset(other.reset().set("_reset", mask))
+    third = one.reset()
+    torch.testing.assert_close(td["observation"][1], third["observation"][1], rtol=0, atol=0)
+    one.set_seed(5)
+    torch.testing.assert_close(one.reset()["observation"], first["observation"], rtol=0, atol=0)
+
+
+def test_threads_do_not_change_the_numbers():
+    runs = []
+    for threads in (1, 3):
+        env = BatchedMujocoEnv("HalfCheetah-v5", 7, threads=threads, dtype=torch.float64)
+        env.reset()
+        actions = torch.rand(7, 20, 6, generator=torch.Generator().manual_seed(0)) * 2 - 1
+        runs.append(env.open_loop(actions)["observation"])
+    assert (runs[0] == runs[1]).all()
+
+
+@pytest.mark.parametrize("name", ["Ant-v5", "FetchPickAndPlace-v4", "FetchPush-v4"])
+def test_open_loop_equals_closed_loop(name):
+    closed, opened = (BatchedMujocoEnv(name, 3, dtype=torch.float64) for _ in range(2))
+    td, _ = closed.reset(), opened.reset()
+    size = closed.action_spec.shape[-1]
+    actions = torch.rand(3, 12, size, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    ahead = opened.open_loop(actions)
+    for t in range(12):
+        td["action"] = actions[:, t]
+        td = closed.step(td)["next"]
+        for key in sorted(td.keys()):
+            torch.testing.assert_close(ahead[key][:, t], td[key], rtol=0, atol=1e-12)
+    assert (closed.stepper.state == opened.stepper.state).all()
+
+
+def test_a_divergence_is_flagged_and_contained(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    envs = [BatchedMujocoEnv("HalfCheetah-v5", 3, threads=1) for _ in range(2)]
+    tds = [env.reset() for env in envs]
+    envs[0].stepper["qvel"][1] = 1e11
+    action = envs[0].action_spec.zero()
+    before = tds[0]["observation"][1].clone()
+    sick = envs[0].step(tds[0].set("action", action))["next"]
+    well = envs[1].step(tds[1].set("action", action))["next"]
+    assert sick["diverged"][:, 0].tolist() == [False, True, False]
+    assert sick["terminated"][:, 0].tolist() == [False, True, False]
+    assert sick["reward"][1] == 0
+    assert (sick["observation"][1] == before).all()
+    for row in (0, 2):
+        assert (sick["observation"][row] == well["observation"][row]).all()
+    mask = torch.tensor([[False], [True], [False]])
+    healed = envs[0].reset(sick.exclude("reward").set("_reset", mask))
+    after = acted(envs[0], healed)
+    assert not after["diverged"].any()
+    assert after["observation"].isfinite().all()
+    assert not list(tmp_path.iterdir())
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_divergence_in_an_open_loop_leaves_nan():
+    env = BatchedMujocoEnv("HalfCheetah-v5", 2, threads=1)
+    env.reset()
+    env.stepper["qvel"][0] = 1e11
+    ahead = env.open_loop(torch.zeros(2, 4, 6))
+    assert ahead["observation"][0].isnan().any(-1).all()
+    assert ahead["observation"][1].isfinite().all()
+    assert ahead["diverged"][..., 0].tolist() == [[True] * 4, [False] * 4]
+    assert ahead["terminated"][0].all()
+
+
+def test_a_time_limit_truncates():
+    env = BatchedMujocoEnv(pendulum(), 2, time_limit=5)
+    rollout = env.rollout(10)
+    assert rollout.shape == (2, 5)
+    assert rollout["next", "truncated"][:, -1].all()
+    assert not rollout["next", "terminated"].any()
+    assert BatchedMujocoEnv(pendulum(), 2).done_keys == ["done", "terminated"]
+
+
+def test_observations_are_not_overwritten_by_later_steps():
+    env = BatchedMujocoEnv(pendulum(observation=lambda now: now.qpos), 2, dtype=torch.float64)
+    td = env.reset()
+    start = td["observation"].clone()
+    for _ in range(3):
+        acted(env, td)
+    assert (td["observation"] == start).all()
+
+
+def test_goals_of_fetch_stay_apart_from_the_object():
+    env = BatchedMujocoEnv("FetchPush-v4", 64)
+    td = env.reset()
+    hand, thing = td["observation"][:, :2], td["achieved_goal"][:, :2]
+    assert ((thing - hand).norm(dim=-1) >= 0.1 - 1e-6).all()
+    assert ((td["desired_goal"][:, :2] - hand).abs() <= 0.15 + 1e-6).all()
+
+
+def test_bad_input_is_refused():
+    env = BatchedMujocoEnv(pendulum(), 3)
+    td = env.reset()
+    td["action"] = torch.tensor([[0.0], [torch.nan], [0.0]])
+    with pytest.raises(ValueError, match=r"finite actions, got 'others in environments \[1\]'"):
+        env.step(td)
+    with pytest.raises(ValueError, match=r"actions of shape \(3, T, 1\), got \(2, 4, 1\)"):
+        env.open_loop(torch.zeros(2, 4, 1))
+    with pytest.raises(RuntimeError, match="batch"):
+        env.step(td[:2])
+    with pytest.raises(ValueError, match="at least one environment, got 0"):
+        BatchedMujocoEnv(pendulum(), 0)
+    with pytest.raises(ValueError, match=r"Hopper-v5 \(did you mean this\?\)"):
+        known_task("Hoper-v5")
+    with pytest.raises(KeyError, match="a component of the state"):
+        env.stepper["position"]
+    with pytest.raises(ValueError, match=r"an array of MjData .*xpos \(did you mean this"):
+        BatchedMujocoEnv(pendulum(outputs=("qpos", "xposs")), 2)
+
+
+@pytest.mark.parametrize("domain", ["cartpole", "walker", "manipulator"])
+def test_models_of_the_control_suite_run_open_loop(domain):
+    suite = pytest.importorskip("dm_control.suite")
+    task = dict(suite.ALL_TASKS)[domain]
+    physics = suite.load(domain, task).physics
+    model = physics.model.ptr
+    env = BatchedMujocoEnv(
+        Task(
+            model=model,
+            frame_skip=2,
+            observation=lambda now: torch.cat([now.qpos, now.qvel], -1),
+            reward=lambda before, after, action: after.qvel[..., 0],
+        ),
+        2,
+        dtype=torch.float64,
+    )
+    env.reset()
+    actions = torch.rand(2, 10, model.nu, generator=torch.Generator().manual_seed(0)) - 0.5
+    ahead = env.open_loop(actions)["observation"]
+    for i in range(2):
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        for t in range(10):
+            data.ctrl[:] = actions[i, t]
+            mujoco.mj_step(model, data, nstep=2)
+            expected = np.concatenate([data.qpos, data.qvel])
+            np.testing.assert_array_equal(ahead[i, t].numpy(), expected)
