@@ -1,0 +1,109 @@
+import matplotlib as mpl
+import numpy as np
+import pytest
+import torch
+from matplotlib.collections import FillBetweenPolyCollection
+
+from torchrl_bayessim.plots import learning_curves, pair_plot, return_per_round
+
+
+@pytest.fixture(autouse=True)
+def untouched_settings():
+    before = dict(mpl.rcParams)
+    yield
+    assert dict(mpl.rcParams) == before
+
+
+def lines(axes, colour):
+    return [line for line in axes.lines if line.get_color() == colour]
+
+
+def test_pair_plot_shows_every_pair_once_with_names_and_units(tmp_path):
+    samples = torch.randn(400, 3)
+    truth = torch.tensor([0.5, -0.5, 1.0])
+    figure = pair_plot(
+        samples,
+        names=["mass", "length", "mu"],
+        units=["kg", "m", ""],
+        prior_samples=3 * torch.randn(400, 3),
+        truth=truth,
+    )
+    assert len(figure.axes) == 6
+    assert [axes.get_xlabel() for axes in figure.axes[3:]] == ["mass [kg]", "length [m]", "mu"]
+    assert figure.axes[1].get_ylabel() == "length [m]"
+    vertical, horizontal = lines(figure.axes[1], "#D55E00")
+    assert vertical.get_xdata()[0] == 0.5
+    assert horizontal.get_ydata()[0] == -0.5
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["posterior", "prior", "truth"]
+    figure.savefig(tmp_path / "pair.png")
+    assert (tmp_path / "pair.png").stat().st_size > 10_000
+
+
+def test_marginals_integrate_to_one():
+    figure = pair_plot(torch.rand(2_000, 1), names=["x"], prior_samples=torch.randn(2_000, 1))
+    for colour in ("#0072B2", "#8A8A8A"):
+        (line,) = lines(figure.axes[0], colour)
+        assert np.trapezoid(line.get_ydata(), line.get_xdata()) == pytest.approx(1, abs=0.03)
+
+
+def test_contours_hold_half_and_nine_tenths_of_the_samples():
+    samples = torch.randn(20_000, 2) @ torch.tensor([[1.0, 0.8], [0.0, 0.3]])
+    figure = pair_plot(samples, names=["a", "b"])
+    contour = figure.axes[1].collections[-1]
+    shares = []
+    for path in contour.get_paths():
+        polygons = [mpl.path.Path(p) for p in path.to_polygons(closed_only=True)]
+        inside = np.any([p.contains_points(samples.numpy()) for p in polygons], axis=0)
+        shares.append(inside.mean())
+    assert shares == pytest.approx([0.9, 0.5], abs=0.04)
+
+
+def test_a_point_mass_can_be_drawn(tmp_path):
+    figure = pair_plot(torch.ones(50, 2), names=["a", "b"], truth=torch.ones(2))
+    figure.savefig(tmp_path / "point.png")
+
+
+def test_learning_curves_have_a_band_for_several_seeds_only():
+    x = torch.arange(4)
+    figure = learning_curves({"many": (x, torch.rand(3, 4)), "one": (x, torch.rand(4))})
+    (axes,) = figure.axes
+    bands = [c for c in axes.collections if isinstance(c, FillBetweenPolyCollection)]
+    assert len(bands) == 1
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["many", "one"]
+
+
+def test_return_per_round_draws_intervals_and_the_baseline():
+    figure = return_per_round(
+        [1.0, 2.0], [(0.5, 1.25), (1.5, 2.0)], baseline=0.8, baseline_interval=(0.7, 0.9)
+    )
+    (axes,) = figure.axes
+    (bars,) = axes.collections
+    segments = [segment[:, 1].tolist() for segment in bars.get_segments()]
+    assert segments == [[0.5, 1.25], [1.5, 2.0]]
+    assert lines(axes, "#8A8A8A")[0].get_ydata()[0] == 0.8
+
+
+@pytest.mark.parametrize(
+    ("draw", "match"),
+    [
+        (lambda: pair_plot(torch.rand(5, 3), names=["a", "b"]), "samples with 2 columns"),
+        (lambda: pair_plot(torch.rand(0, 1), names=["a"]), "samples with 1 columns"),
+        (lambda: pair_plot(torch.rand(5, 1) / 0, names=["a"]), "finite samples"),
+        (lambda: pair_plot(torch.rand(5, 1), names=["a"], units=["m", "s"]), "one unit per name"),
+        (
+            lambda: pair_plot(torch.rand(5, 1), names=["a"], truth=torch.rand(2)),
+            "truth with 1 columns",
+        ),
+        (lambda: learning_curves({}), "at least one curve"),
+        (
+            lambda: learning_curves({"a": (torch.rand(3), torch.rand(4))}),
+            r"x \(P,\) and y .* in curve 'a'",
+        ),
+        (lambda: return_per_round([], []), r"one \(low, high\) per mean"),
+        (lambda: return_per_round([1.0], [(2.0, 3.0)]), "low <= mean <= high"),
+    ],
+)
+def test_bad_input_is_refused(draw, match):
+    with pytest.raises(ValueError, match=match):
+        draw()
