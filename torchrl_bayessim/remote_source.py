@@ -54,9 +54,7 @@ class PolicyWithSource(TensorDictModuleWrapper):
         return next((m for m in modules if isinstance(m, PolicyWithSource)), None)
 
 
-def push_source(
-    collector: BaseCollector, source: Source, *, key: tuple[int | str, ...], policy: Any = None
-) -> None:
+def push_source(collector: BaseCollector, source: Source, *, key: tuple[int | str, ...]) -> None:
     """Let every environment of ``collector`` draw from ``source`` from its next reset on.
 
     Running episodes keep their θ. The policy's current weights are pushed too.
@@ -65,20 +63,19 @@ def push_source(
         collector: One whose policy is, or contains, a `PolicyWithSource`.
         source: Where the table is drawn from.
         key: What the draws are for, e.g. ``(seed, round)``: same key, same table.
-        policy: The policy, for collectors that keep it only on their workers (Ray).
 
     Raises:
         TypeError: The policy carries no table.
         ValueError: ``source`` has other parameters than the policy was made for.
     """
-    policy = getattr(collector, "policy", None) if policy is None else policy
+    policy: Any = getattr(collector, "policy", None)
     carrier = PolicyWithSource.inside(policy)
     if carrier is None:
         raise TypeError(
             message(
                 "a collector whose policy is a PolicyWithSource",
                 type(policy).__name__,
-                hint="build the collector with PolicyWithSource(policy, prior), or give policy=",
+                hint="build the collector with PolicyWithSource(policy, prior)",
             )
         )
     names = names_of(source)

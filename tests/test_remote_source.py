@@ -1,0 +1,141 @@
+from functools import partial
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.envs import GymEnv, SerialEnv, TransformedEnv
+
+from torchrl_bayessim.physics.attributes import AttributePhysics
+from torchrl_bayessim.remote_source import PolicyWithSource, push_source
+from torchrl_bayessim.sources import Empirical, draw
+from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
+
+
+class Around:
+    """Masses between ``low`` and ``low + 0.1``."""
+
+    names = ("masspole",)
+
+    def __init__(self, low):
+        self.low = low
+
+    def sample(self, shape, *, generator):
+        return self.low + 0.1 * torch.rand((*shape, 1), generator=generator)
+
+
+class Bang(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.linear = torch.nn.Linear(4, 2)
+
+    def forward(self, observation):
+        return torch.nn.functional.one_hot(self.linear(observation).argmax(-1), 2)
+
+
+def single():
+    return TransformedEnv(GymEnv("CartPole-v1"), ApplyPhysics(AttributePhysics("masspole")))
+
+
+def make():
+    return TransformedEnv(SerialEnv(2, single), DomainRandomizer(Around(0.2)))
+
+
+def carrying(draws=64):
+    policy = TensorDictModule(Bang(), in_keys=["observation"], out_keys=["action"])
+    return PolicyWithSource(policy, Around(0.2), draws=draws)
+
+
+def collector(kind, policy):
+    ray = kind.__name__ == "RayCollector"
+    options = {} if ray else {"auto_register_policy_transforms": False}
+    envs = make if kind is Collector else [make, make]
+    return kind(envs, policy, frames_per_batch=160, total_frames=-1, **options)
+
+
+def pushed_within(collector, batches):
+    """Push after the second batch; return θ before and in the last batch."""
+    seen = []
+    for i, batch in enumerate(collector):
+        seen.append(batch["theta"].reshape(-1).unique())
+        if i == 1:
+            push_source(collector, Around(1.2), key=(0, "round", 1))
+        if i == batches:
+            break
+    collector.shutdown()
+    return torch.cat(seen[:2]).unique(), seen[-1]
+
+
+def ray_collector(*args, **options):
+    from torchrl.collectors.distributed import RayCollector
+
+    return RayCollector(*args, sync=True, **options)
+
+
+ray_collector.__name__ = "RayCollector"
+
+
+@pytest.mark.parametrize(
+    "kind", [Collector, MultiSyncCollector, MultiAsyncCollector, ray_collector]
+)
+def test_a_pushed_source_reaches_every_worker_and_workers_draw_differently(kind, request):
+    if kind is ray_collector:
+        pytest.importorskip("ray")
+    policy = carrying()
+    before, after = pushed_within(collector(kind, policy), batches=6)
+    assert (before > 0.2).all()
+    assert (before < 0.3).all()
+    assert (after > 1.2).all()
+    assert (after < 1.3).all()
+    table = draw(Around(1.2), 64, key=(0, "round", 1, "pushed")).flatten()
+    assert torch.isin(after, table).all()
+    expected = {0: make().reset()["theta"].flatten()}
+    assert torch.isin(expected[0], before).all()
+    if kind is not Collector:  # the second worker's environments are numbers 2 and 3
+        randomizer = DomainRandomizer(Around(0.2), first_environment=2)
+        env = TransformedEnv(SerialEnv(2, single), randomizer)
+        assert torch.isin(env.reset()["theta"].flatten(), before).all()
+
+
+def test_which_worker_runs_an_environment_does_not_matter():
+    """Four environments in one process, or two in each of two: the same θ in the same episodes."""
+
+    def first_episodes(kind, makers):
+        policy = carrying()
+        policy.draws.copy_(draw(Around(0.7), 64, key=(5,)))
+        options = {"frames_per_batch": 8, "total_frames": 8, "reset_at_each_iter": True}
+        made = kind(makers, policy, **options, auto_register_policy_transforms=False)
+        theta = next(iter(made))["theta"][..., 0, :].reshape(-1)
+        made.shutdown()
+        return theta
+
+    def four():
+        return TransformedEnv(SerialEnv(4, single), DomainRandomizer(Around(0.2)))
+
+    together = first_episodes(Collector, four)
+    split = first_episodes(MultiSyncCollector, [make, make])
+    assert torch.equal(together, split)
+    assert len(together.unique()) == 4
+    assert (together > 0.7).all()
+
+
+def test_the_policy_acts_as_before_and_its_table_is_saved_with_it():
+    policy = carrying()
+    env = make()
+    td = env.reset()
+    assert torch.equal(policy(td.clone())["action"], policy.td_module(td.clone())["action"])
+    assert policy.in_keys == ["observation"]
+    assert policy.out_keys == ["action"]
+    assert "draws" in policy.state_dict()
+
+
+def test_push_needs_a_carrier_and_the_same_parameters():
+    policy = TensorDictModule(Bang(), in_keys=["observation"], out_keys=["action"])
+    without = collector(Collector, policy)
+    with pytest.raises(TypeError, match=r"build the collector with PolicyWithSource\("):
+        push_source(without, Around(1.2), key=(0,))
+    push = partial(push_source, collector(Collector, carrying()), key=(0,))
+    with pytest.raises(ValueError, match=r"a source over \('masspole',\), got \('length',\)"):
+        push(Empirical([[1.0]], names=("length",)))
+    with pytest.raises(ValueError, match=r"draws of shape \(64, 1\), got \(64, 2\)"):
+        push(Empirical([[1.0, 2.0]]))
