@@ -1,3 +1,4 @@
+import sys
 from functools import partial
 
 import pytest
@@ -47,10 +48,10 @@ def carrying(draws=64):
 
 
 def collector(kind, policy):
-    ray = kind.__name__ == "RayCollector"
+    ray = isinstance(kind, partial)
     options = {} if ray else {"auto_register_policy_transforms": False}
     envs = make if kind is Collector else [make, make]
-    return kind(envs, policy, frames_per_batch=160, total_frames=-1, **options)
+    return kind(envs, policy, frames_per_batch=160, total_frames=3200, **options)
 
 
 def pushed_within(collector, batches):
@@ -66,35 +67,32 @@ def pushed_within(collector, batches):
     return torch.cat(seen[:2]).unique(), seen[-1]
 
 
-def ray_collector(*args, **options):
-    from torchrl.collectors.distributed import RayCollector
-
-    return RayCollector(*args, sync=True, **options)
-
-
-ray_collector.__name__ = "RayCollector"
-
-
-@pytest.mark.parametrize(
-    "kind", [Collector, MultiSyncCollector, MultiAsyncCollector, ray_collector]
-)
-def test_a_pushed_source_reaches_every_worker_and_workers_draw_differently(kind, request):
-    if kind is ray_collector:
-        pytest.importorskip("ray")
+def assert_push_arrives(kind):
     policy = carrying()
     before, after = pushed_within(collector(kind, policy), batches=6)
     assert (before > 0.2).all()
     assert (before < 0.3).all()
-    assert (after > 1.2).all()
-    assert (after < 1.3).all()
     table = draw(Around(1.2), 64, key=(0, "round", 1, "pushed")).flatten()
     assert torch.isin(after, table).all()
-    expected = {0: make().reset()["theta"].flatten()}
-    assert torch.isin(expected[0], before).all()
+    assert torch.isin(make().reset()["theta"].flatten(), before).all()
     if kind is not Collector:  # the second worker's environments are numbers 2 and 3
         randomizer = DomainRandomizer(Around(0.2), first_environment=2)
         env = TransformedEnv(SerialEnv(2, single), randomizer)
         assert torch.isin(env.reset()["theta"].flatten(), before).all()
+
+
+@pytest.mark.parametrize("kind", [Collector, MultiSyncCollector, MultiAsyncCollector])
+def test_a_pushed_source_reaches_every_worker_and_workers_draw_differently(kind):
+    assert_push_arrives(kind)
+
+
+@pytest.mark.filterwarnings("ignore")  # Ray's own
+def test_a_pushed_source_reaches_workers_of_ray():
+    ray = pytest.importorskip("ray")
+    from torchrl.collectors.distributed import RayCollector
+
+    ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
+    assert_push_arrives(partial(RayCollector, sync=True))
 
 
 def test_which_worker_runs_an_environment_does_not_matter():
