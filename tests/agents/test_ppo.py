@@ -23,9 +23,7 @@ class InformedCartPole(CartPoleEnv):
         super()._make_specs()
         n = self.batch_size[0]
         self.observation_spec = Composite(
-            observation=self.observation_spec["observation"],
-            theta=Unbounded((n, 1)),
-            shape=(n,),
+            dict(self.observation_spec.items()) | {"theta": Unbounded((n, 1))}, shape=(n,)
         )
 
     def _output(self, terminated, truncated):

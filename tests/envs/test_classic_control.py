@@ -269,6 +269,8 @@ def test_a_diverged_environment_ends_and_the_rest_go_on():
     out = env.rollout(30)["next"][:, -1]
     assert out["observation"].isfinite().all()
     assert out["terminated"].tolist() == [[False], [True]]
+    assert out["diverged"].tolist() == [[False], [True]]
+    assert out["reward"].tolist() == [[-1.0], [0.0]]
 
 
 @pytest.mark.parametrize(

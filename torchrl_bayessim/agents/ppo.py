@@ -13,24 +13,20 @@ from __future__ import annotations
 __all__ = ["PPO"]
 
 import copy
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import InteractionType, TensorDictModule
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.data import Bounded, Categorical, OneHot, Unbounded
-from torchrl.data.tensor_specs import TensorSpec
 from torchrl.envs import EnvBase
-from torchrl.modules import IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from ..errors import SimulationError, message
 from ..randomness import isolated
-from .normalizer import Normalizer
+from .networks import MLP, actor, width
 
 
 class PPO:
@@ -105,8 +101,8 @@ class PPO:
         seen: list[Any] = list(observation_keys)
         known: list[Any] = [*seen, *critic_keys]
         with isolated(seed, "ppo parameters"):
-            self.policy = _actor(env, seen, hidden=hidden, initial_std=initial_std)
-            value = _Network(_width(env, known), hidden, 1, gain=1.0)
+            self.policy = actor(env, seen, hidden=hidden, initial_std=initial_std)
+            value = MLP(width(env, known), hidden, 1, gain=1.0)
             self.critic = TensorDictModule(value, in_keys=known, out_keys=["state_value"])
         self._loss = ClipPPOLoss(
             self.policy,
@@ -210,7 +206,7 @@ class PPO:
                         sums[name] = sums.get(name, 0.0) + value
         for network in (self.policy, self.critic):
             for module in network.modules():
-                if isinstance(module, _Network):
+                if isinstance(module, MLP):
                     module.normalizer.observe(
                         torch.cat([frames.get(key) for key in network.in_keys], -1)
                     )
@@ -235,95 +231,6 @@ class PPO:
         return {name: losses[name].detach() for name in _REPORTED} | {"gradient_norm": norm}
 
 
-class _Network(nn.Module):
-    """Normalised inputs, tanh layers, a linear head; orthogonal initial weights."""
-
-    def __init__(self, inputs: int, hidden: Sequence[int], outputs: int, *, gain: float) -> None:
-        super().__init__()
-        self.normalizer = Normalizer(inputs)
-        layers: list[nn.Module] = []
-        for width in hidden:
-            layers += [_linear(inputs, width, math.sqrt(2)), nn.Tanh()]
-            inputs = width
-        self.layers = nn.Sequential(*layers, _linear(inputs, outputs, gain))
-
-    def forward(self, *inputs: Tensor) -> Tensor:
-        return self.layers(self.normalizer(torch.cat(inputs, -1)))
-
-
-class _Gaussian(nn.Module):
-    """Location from a network, scale from a free parameter."""
-
-    def __init__(self, network: nn.Module, size: int, initial_std: float) -> None:
-        super().__init__()
-        self.network = network
-        self.log_scale = nn.Parameter(torch.full((size,), math.log(initial_std)))
-
-    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        loc = self.network(*inputs)
-        return loc, self.log_scale.exp().expand_as(loc)
-
-
-class _OneHotCategorical(OneHotCategorical):
-    """TorchRL's, except that a tie has one winner: there, the mode has a one for each."""
-
-    @property
-    def mode(self) -> Tensor:
-        return nn.functional.one_hot(self.logits.argmax(-1), self.logits.shape[-1])
-
-    @property
-    def deterministic_sample(self) -> Tensor:
-        return self.mode
-
-
-def _linear(inputs: int, outputs: int, gain: float) -> nn.Linear:
-    layer = nn.Linear(inputs, outputs)
-    nn.init.orthogonal_(layer.weight, gain)
-    nn.init.zeros_(layer.bias)
-    return layer
-
-
-def _width(env: EnvBase, keys: Sequence[str]) -> int:
-    available = list(env.observation_spec.keys(include_nested=True, leaves_only=True))
-    for key in keys:
-        if key not in available:
-            raise ValueError(message("an observation of the environment", key, available=available))
-    return sum(env.observation_spec[key].shape[-1] for key in keys)
-
-
-def _actor(
-    env: EnvBase, keys: list[Any], *, hidden: Sequence[int], initial_std: float
-) -> ProbabilisticActor:
-    spec: TensorSpec = env.action_spec_unbatched
-    inputs = _width(env, keys)
-    options: dict[str, Any] = {}
-    if type(spec) in (OneHot, Categorical):  # not their product spaces, which are subclasses
-        distribution = _OneHotCategorical if isinstance(spec, OneHot) else _Categorical
-        module = _Network(inputs, hidden, spec.n, gain=0.01)
-        parameters: list[Any] = ["logits"]
-    elif isinstance(spec, Bounded | Unbounded):
-        size = spec.shape[-1]
-        network = _Network(inputs, hidden, size, gain=0.01)
-        module, parameters = _Gaussian(network, size, initial_std), ["loc", "scale"]
-        distribution = IndependentNormal
-        if isinstance(spec, Bounded):
-            distribution = TanhNormal
-            options = {"low": spec.low, "high": spec.high, "tanh_loc": False}
-    else:
-        raise TypeError(
-            message("a discrete, bounded or unbounded action spec", type(spec).__name__)
-        )
-    return ProbabilisticActor(
-        TensorDictModule(module, in_keys=keys, out_keys=parameters),
-        in_keys=parameters,
-        distribution_class=distribution,
-        distribution_kwargs=options,
-        return_log_prob=True,
-        default_interaction_type=InteractionType.RANDOM,
-    )
-
-
-_Categorical = torch.distributions.Categorical  # index actions
 _REPORTED = (
     "loss_objective",
     "loss_critic",

@@ -29,6 +29,9 @@ from ...randomness import seed_from
 class ClassicControlEnv(EnvBase):
     """Base of the batched classic-control environments; a subclass fills in one system.
 
+    An environment whose state is no longer finite terminates with the observation it had before, a
+    reward of zero, and ``diverged`` set; the others do not notice.
+
     Args:
         num_envs: Number of environments ``N``; the batch size is ``[N]``.
         seed: Seed of the reset noise: same seed, same run.
@@ -159,7 +162,9 @@ class ClassicControlEnv(EnvBase):
         n, device = self.batch_size[0], self.device
         shape, column = torch.Size([n, self._observation_size]), torch.Size([n, 1])
         self.observation_spec = Composite(
-            observation=Unbounded(shape, dtype=self._float, device=device), shape=(n,)
+            observation=Unbounded(shape, dtype=self._float, device=device),
+            diverged=Categorical(2, shape=column, dtype=torch.bool, device=device),
+            shape=(n,),
         )
         self.action_spec = self._action_spec()
         self.reward_spec = Unbounded(column, dtype=self._float, device=device)
@@ -187,18 +192,19 @@ class ClassicControlEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = self._decode(tensordict.get("action"))
         state, reward, terminated = self._advance(self._state, action)
+        diverged = self._never
         if not torch.isfinite(state.sum()):
-            # A diverged environment ends where it last was; the others go on.
-            diverged = ~state.isfinite().all(-1)
-            state = torch.where(diverged[:, None], self._state, state)
-            terminated = terminated | diverged
+            diverged = ~state.isfinite().all(-1, keepdim=True)
+            state = torch.where(diverged, self._state, state)
+            reward = reward.masked_fill(diverged[:, 0], 0.0)
+            terminated = terminated | diverged[:, 0]
         self._state = state
         self._elapsed += 1
         truncated = self._never
         if self.max_steps is not None:
             truncated = (self._elapsed >= self.max_steps)[:, None]
         output = self._output(terminated[:, None], truncated)
-        return output.set("reward", reward[:, None])
+        return output.set("reward", reward[:, None]).set("diverged", diverged.clone())
 
     def _output(self, terminated: Tensor, truncated: Tensor) -> TensorDictBase:
         values = {
@@ -206,6 +212,7 @@ class ClassicControlEnv(EnvBase):
             "terminated": terminated.clone(),
             "truncated": truncated.clone(),
             "done": terminated | truncated,
+            "diverged": self._never.clone(),
         }
         return TensorDict(values, batch_size=self.batch_size, device=self.device)
 
