@@ -173,6 +173,15 @@ class ModelBatch:
         selected = np.arange(self.num_envs) if rows is None else np.flatnonzero(rows)
         native.refresh(model._address, data._address, selected, self.table, *self._derived)
 
+    def resize(self, num_envs: int) -> None:
+        """Change the number of environments; new ones have the nominal physics."""
+        if num_envs > self.num_envs:
+            nominal = [self._nominal(*key) for key in self._columns]
+            more = np.tile(np.array(nominal), (num_envs - self.num_envs, 1))
+            self.table = np.concatenate([self.table, more])
+        self.table = self.table[:num_envs].copy()
+        self.num_envs = num_envs
+
     def addresses(self, model: mujoco.MjModel) -> NDArray[np.int64]:
         """Return where the columns of the table belong in a copy of the model, shape ``(K,)``.
 

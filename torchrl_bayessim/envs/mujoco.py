@@ -113,7 +113,18 @@ class BatchedMujocoEnv(EnvBase):
 
         Returns:
             What a reset returns.
+
+        Raises:
+            KeyError: There is no such component.
+            ValueError: A component has another shape, or is not finite.
         """
+        known = [*self.stepper.components, *self._extras]
+        for name, value in components.items():
+            if name not in known:
+                raise KeyError(message("a component of the state", name, available=known))
+            if len(value) != self.num_envs or not torch.as_tensor(value).isfinite().all():
+                expected = f"{self.num_envs} rows of finite numbers for {name}"
+                raise ValueError(message(expected, value))
         rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
         self._start(rows, {name: np.asarray(value)[rows] for name, value in components.items()})
         return self._started()

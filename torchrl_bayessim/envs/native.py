@@ -13,8 +13,9 @@ The arguments of the kernels, as `Stepper` builds them:
 * ``worker``: ``(thread, blocks, addresses, jacobian)``, what one thread owns: addresses in the
   order of `OWNED`; address and size of each output array; addresses of the columns of ``table``;
   scratch space ``(6, nv)``;
-* ``batch``: ``(table, state, signature, anchor)``, one row per environment; ``signature`` says what
-  a state holds, ``anchor`` is the last pose of the body that follows the mocap body;
+* ``batch``: ``(table, sharing, state, signature)``, one row per environment, but of the table one
+  per ``sharing`` environments; ``signature`` says what a state holds, and with a weld it ends in
+  the last known pose of the body that follows the mocap body;
 * ``drive``: ``(relative, weld, pinned, site_ids, contact_forces)``, see `Drive`;
 * ``queue``: one integer, zero at the start, shared by the threads;
 * ``rows``: the environments to treat;
@@ -115,7 +116,7 @@ def _collect(thread, blocks, site_ids, jacobian, output):
 
 
 @compiled
-def _command(thread, drive, command, anchor):
+def _command(thread, drive, command, state):
     """Write controls, some relative to a position, and step the mocap body from its weld."""
     relative, weld = drive[0], drive[1]
     qpos, ctrl = doubles(thread[_QPOS]), doubles(thread[_CTRL])
@@ -125,20 +126,20 @@ def _command(thread, drive, command, anchor):
     if weld >= 0:
         position, quaternion = doubles(thread[_MOCAP_POS]), doubles(thread[_MOCAP_QUAT])
         for j in range(3):
-            position[j] = anchor[j] + command[nu + j]
+            position[j] = state[j - 7] + command[nu + j]
         for j in range(4):
-            quaternion[j] = anchor[3 + j] + command[nu + 3 + j]
+            quaternion[j] = state[j - 4] + command[nu + 3 + j]
 
 
 @compiled
-def _remember(thread, weld, anchor):
+def _remember(thread, weld, state):
     """Keep the pose of the welded body, from which the next command steps the mocap body."""
     if weld >= 0:
         position, quaternion = doubles(thread[_XPOS]), doubles(thread[_XQUAT])
         for j in range(3):
-            anchor[j] = position[3 * weld + j]
+            state[j - 7] = position[3 * weld + j]
         for j in range(4):
-            anchor[3 + j] = quaternion[4 * weld + j]
+            state[j - 4] = quaternion[4 * weld + j]
 
 
 @compiled
@@ -165,7 +166,7 @@ def _control_step(thread, drive, substeps):
 def begin(worker, batch, drive, queue, rows, outputs):
     """Set the states of ``rows`` in clean data, and evaluate the outputs there."""
     thread, blocks, addresses, jacobian = worker
-    table, state, signature, anchor = batch
+    table, sharing, state, signature = batch
     _, weld, _, site_ids, _ = drive
     m, d = thread[_MODEL], thread[_DATA]
     while True:
@@ -175,11 +176,11 @@ def begin(worker, batch, drive, queue, rows, outputs):
         i = rows[k]
         mj_reset(m, d)
         _hush(thread)
-        override(addresses, table, i)
+        override(addresses, table, i // sharing)
         mj_set_state(m, d, _row(state, i), signature)
         mj_forward(m, d)
         mj_get_state(m, d, _row(state, i), signature)
-        _remember(thread, weld, anchor[i])
+        _remember(thread, weld, state[i])
         _collect(thread, blocks, site_ids, jacobian, outputs[i])
 
 
@@ -191,7 +192,7 @@ def advance(worker, batch, drive, queue, rows, outputs, commands, sequence, subs
     diverges the state stays as it was and the outputs are NaN from that control step on.
     """
     thread, blocks, addresses, jacobian = worker
-    table, state, signature, anchor = batch
+    table, sharing, state, signature = batch
     _, weld, _, site_ids, _ = drive
     m, d = thread[_MODEL], thread[_DATA]
     while True:
@@ -200,17 +201,17 @@ def advance(worker, batch, drive, queue, rows, outputs, commands, sequence, subs
             break
         i = rows[k]
         _hush(thread)
-        override(addresses, table, i)
+        override(addresses, table, i // sharing)
         mj_set_state(m, d, _row(state, i), signature)
         code = 0
         for t in range(commands.shape[1]):
             if code == 0:
-                _command(thread, drive, commands[sequence[i], t], anchor[i])
+                _command(thread, drive, commands[sequence[i], t], state[i])
                 code = _control_step(thread, drive, substeps)
             if code:
                 outputs[i, t] = math.nan
             else:
-                _remember(thread, weld, anchor[i])
+                _remember(thread, weld, state[i])
                 _collect(thread, blocks, site_ids, jacobian, outputs[i, t])
         status[i] = code
         if code:

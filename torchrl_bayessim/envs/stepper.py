@@ -2,7 +2,8 @@
 
 The simulations are rows of arrays: `Stepper.state` holds everything that decides what follows
 (``mjSTATE_INTEGRATION``: time, positions, velocities, activations, warm start, controls, forces,
-mocap poses), `Stepper.models` the physics. Threads work through the rows; see `native`.
+mocap poses; and the pose from which a weld's next command starts), `Stepper.models` the physics.
+Threads work through the rows; see `native`.
 """
 
 from __future__ import annotations
@@ -110,6 +111,7 @@ class Stepper:
         outputs: Arrays of ``MjData`` to read after each control step, such as ``qpos``, ``xpos``,
             ``sensordata``; ``site_velocity[name]`` is the velocity of a site, linear then angular.
         drive: How commands enter.
+        sharing: How many consecutive simulations share one physics; it divides ``N``.
         threads: Threads to step with; default all cores that this process may use.
 
     Attributes:
@@ -128,29 +130,36 @@ class Stepper:
         *,
         outputs: tuple[str, ...] = ("qpos", "qvel"),
         drive: Drive | None = None,
+        sharing: int = 1,
         threads: int | None = None,
     ) -> None:
         drive = Drive() if drive is None else drive
         sites = [name for name in outputs if name.startswith("site_velocity[")]
         arrays = tuple(name for name in outputs if name not in sites)
-        self.models = ModelBatch(model, num_envs)
-        self.num_envs = num_envs
         threads = min(threads or len(os.sched_getaffinity(0)), num_envs)
         self._workers = [_Worker(model, arrays) for _ in range(threads)]
         self._pool = ThreadPoolExecutor(max(1, threads - 1))
         self._queue = np.zeros(1, dtype=np.int64)
-        self._all = np.arange(num_envs)
         self._drive = _resolve(model, drive, sites)
-        self._anchor = np.zeros((num_envs, 7))
+        self._sharing = sharing
         self.command_size = model.nu + (0 if drive.weld is None else 7)
         self.layout = _layout(self._workers[0].data, arrays + tuple(sites))
         self.output_size = sum(int(np.prod(shape)) for _, shape in self.layout.values())
+        self.components = _components(model, welded=drive.weld is not None)
+        self.initial = np.zeros(max(part.stop for part in self.components.values()))
+        size = mujoco.mj_stateSize(model, _SIGNATURE)
+        mujoco.mj_getState(model, mujoco.MjData(model), self.initial[:size], _SIGNATURE)
+        self.models = ModelBatch(model, num_envs // sharing)
+        self.resize(num_envs)
+
+    def resize(self, num_envs: int) -> None:
+        """Change the number of simulations; all start anew, and new physics are nominal."""
+        self.num_envs = num_envs
+        self.models.resize(num_envs // self._sharing)
+        self.state = np.tile(self.initial, (num_envs, 1))
         self.outputs = np.zeros((num_envs, 1, self.output_size))
         self.status = np.zeros(num_envs, dtype=np.int64)
-        self.components = _components(model)
-        self.initial = np.empty(mujoco.mj_stateSize(model, _SIGNATURE))
-        mujoco.mj_getState(model, mujoco.MjData(model), self.initial, _SIGNATURE)
-        self.state = np.tile(self.initial, (num_envs, 1))
+        self._all = np.arange(num_envs)
 
     def __getitem__(self, component: str) -> NDArray[np.float64]:
         """Return a view of a component of the states, such as ``qpos``, shape ``(N, size)``."""
@@ -194,18 +203,23 @@ class Stepper:
             outputs: Where to write; default a new array.
 
         Returns:
-            The outputs after each command, shape ``(N, T, M)``; NaN after a divergence.
+            The outputs after each command, shape ``(N, T, M)``: NaN after a divergence, anything in
+            rows that were not advanced.
 
         Raises:
+            ValueError: ``commands`` has another shape.
             SimulationError: MuJoCo ran out of memory for contacts or constraints.
         """
+        if commands.ndim != 3 or commands.shape[2] != self.command_size:
+            expected = f"commands of shape (B, T, {self.command_size})"
+            raise ValueError(message(expected, commands.shape))
         if outputs is None:
-            outputs = np.full((self.num_envs, commands.shape[1], self.output_size), np.nan)
+            outputs = np.empty((self.num_envs, commands.shape[1], self.output_size))
         rows = self._all if rows is None else rows
         sequence = self._all if sequence is None else sequence
         self._run(native.advance, rows, outputs, commands, sequence, substeps, self.status)
-        if self.status.max() == native.OVERFLOW:
-            full = np.flatnonzero(self.status == native.OVERFLOW).tolist()
+        full = rows[self.status[rows] == native.OVERFLOW].tolist()
+        if full:
             expected = "room for all contacts and constraints"
             hint = "raise <size memory='…'/> in the MJCF"
             raise SimulationError(message(expected, f"environments {full} without", hint=hint))
@@ -214,7 +228,7 @@ class Stepper:
     def _run(self, kernel: Callable[..., None], *arguments: object) -> None:
         """Let all threads work through the rows, this one among them."""
         self._queue[0] = 0
-        batch = self.models.table, self.state, _SIGNATURE, self._anchor
+        batch = self.models.table, self._sharing, self.state, _SIGNATURE
         calls = []
         for worker in self._workers:
             if len(worker.addresses) != self.models.table.shape[1]:
@@ -258,11 +272,12 @@ def _layout(
     return layout
 
 
-def _components(model: mujoco.MjModel) -> dict[str, slice]:
+def _components(model: mujoco.MjModel, *, welded: bool) -> dict[str, slice]:
     """Return where each component is in a state."""
-    slices, start = {}, 0
-    for bit, name in enumerate(_COMPONENTS):
-        size = mujoco.mj_stateSize(model, 1 << bit)
-        slices[name] = slice(start, start + size)
-        start += size
-    return slices
+    sizes = {name: mujoco.mj_stateSize(model, 1 << i) for i, name in enumerate(_COMPONENTS)}
+    if welded:
+        sizes["weld_pose"] = 7
+    ends = np.cumsum(list(sizes.values())).tolist()
+    return {
+        name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)
+    }

@@ -16,6 +16,7 @@ from types import SimpleNamespace
 
 import mujoco
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -24,6 +25,14 @@ from .stepper import Drive
 
 Readings = SimpleNamespace
 Reset = Callable[[Draws], Mapping[str, NDArray[np.float64]]]
+
+
+def _positions_and_velocities(now: Readings) -> Tensor:
+    return torch.cat([now.qpos, now.qvel], -1)
+
+
+def _no_reward(_: Readings, after: Readings, action: Tensor) -> Tensor:  # noqa: ARG001
+    return after.qpos.new_zeros(after.qpos.shape[:-1])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +55,9 @@ class Task:
     Attributes:
         model: The model, in its nominal physics.
         frame_skip: Time steps per control step.
-        observation: ``readings -> (*batch, O)``, or a dictionary of such tensors.
-        reward: ``(before, after, action) -> (*batch,)``.
+        observation: ``readings -> (*batch, O)``, or a dictionary of such tensors; default
+            positions and velocities.
+        reward: ``(before, after, action) -> (*batch,)``; default zero.
         termination: ``readings -> (*batch,)`` boolean; default never.
         reset: ``draws -> {component of the state or own name: (B, size)}``; default the model's
             initial state.
@@ -61,8 +71,8 @@ class Task:
 
     model: mujoco.MjModel
     frame_skip: int
-    observation: Callable[[Readings], Tensor | dict[str, Tensor]]
-    reward: Callable[[Readings, Readings, Tensor], Tensor]
+    observation: Callable[[Readings], Tensor | dict[str, Tensor]] = _positions_and_velocities
+    reward: Callable[[Readings, Readings, Tensor], Tensor] = _no_reward
     termination: Callable[[Readings], Tensor] | None = None
     reset: Reset | None = None
     outputs: tuple[str, ...] = ("qpos", "qvel")

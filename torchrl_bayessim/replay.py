@@ -1,0 +1,261 @@
+"""Recorded actions again, from recorded states, under many physics: what would have happened.
+
+Given ``S`` segments of logs, each a start state and ``T`` actions, and ``P`` parameter vectors,
+`Replay` simulates all ``P × S`` combinations in one native call, ``y[p, s, t] = f(x_s, a_{s,:t};
+θ_p)``. It is the inner loop of fitting a simulator to logs, so whatever does not depend on θ is set
+up once. A `Hook` adds what the simulator leaves out: forces, or actuators with dynamics.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Hook", "Replay", "replay"]
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from torch import Tensor
+
+from .envs.draws import Draws
+from .envs.model_batch import ModelBatch
+from .envs.stepper import Stepper
+from .envs.task import Readings, Task
+from .envs.tasks.catalogue import known_task
+from .errors import message
+from .physics.protocol import Physics
+
+Hook = Callable[[Readings], Mapping[str, Tensor]]
+"""``readings -> {"qfrc_applied": …, "ctrl": …}``, called with the whole batch before every step.
+
+Readings are tensors ``(P, S, size)``: the components of the state (``time``, ``qpos``, ``qvel``,
+``act``, …) and ``ctrl``, the recorded command; they are views, to be read and not kept. What is
+returned is written, broadcast to ``(P, S, size)``: a ``ctrl`` to use instead of the recorded one in
+this step, generalised forces ``qfrc_applied`` or other components, which stay until written again.
+"""
+
+
+class Replay:
+    """Segments of logs, ready to be simulated under any physics.
+
+    Example:
+        >>> segments = {
+        ...     "qpos": torch.tensor([[0.0, 1.25, 0, 0, 0, 0]]),
+        ...     "qvel": torch.zeros(1, 6),
+        ...     "action": torch.zeros(1, 20, 3),
+        ... }
+        >>> from torchrl_bayessim.physics.mujoco import MujocoPhysics
+        >>> hop = Replay("Hopper-v5", segments, physics=MujocoPhysics("opt.gravity[2]"))
+        >>> y = hop(torch.tensor([[-9.81], [-1.6]]))
+        >>> y["qpos"].shape
+        torch.Size([2, 1, 20, 6])
+        >>> y["qpos"][:, 0, -1, 1].round(decimals=2)  # it falls less on the moon
+        tensor([1.2000, 1.2300], dtype=torch.float64)
+
+    Args:
+        task: A name or a `Task`; of a task, the model, ``frame_skip``, ``command``, ``drive`` and
+            ``observation`` are used.
+        segments: ``action``, shape ``(S, T, A)``, each held for ``frame_skip`` steps, and the
+            components of the start states, shape ``(S, size)``: ``qpos``, ``qvel`` and where known
+            ``act``, ``time``, ``warmstart``, ``mocap_pos``, ``mocap_quat``, ``weld_pose``; the
+            others start at the model's defaults. A tensordict will do.
+        physics: What the columns of theta set; default nothing.
+        outputs: Arrays of ``MjData`` to return, and ``observation`` for the task's observation.
+        threads: Threads to step with; default all cores that this process may use.
+
+    Raises:
+        ValueError: The segments disagree in number, lack positions or actions, or are not finite.
+
+    Attributes:
+        task: The task.
+        physics: What the columns of theta set.
+        num_segments: The number of segments ``S``.
+        steps: Actions per segment ``T``.
+    """
+
+    def __init__(
+        self,
+        task: str | Task,
+        segments: Mapping[str, Tensor],
+        *,
+        physics: Physics | None = None,
+        outputs: tuple[str, ...] = ("qpos", "qvel"),
+        threads: int | None = None,
+    ) -> None:
+        self.task = known_task(task) if isinstance(task, str) else task
+        self.physics = physics
+        self._names = outputs
+        read = tuple(name for name in outputs if name != "observation")
+        if "observation" in outputs:
+            read += tuple(name for name in self.task.outputs if name not in read)
+        given = {key: torch.as_tensor(segments[key]).double() for key in segments.keys()}  # noqa: SIM118
+        action = _checked(given)
+        self.num_segments, self.steps = action.shape[:2]
+        # commands in the precision of the actions, as in an environment
+        action = torch.as_tensor(segments["action"])
+        command = action if self.task.command is None else self.task.command(action)
+        self._commands = command.to(torch.float64).contiguous().numpy()
+        self._stepper = Stepper(
+            self.task.model,
+            self.num_segments,
+            outputs=read,
+            drive=self.task.drive,
+            sharing=self.num_segments,
+            threads=threads,
+        )
+        self._starts = np.tile(self._stepper.initial, (self.num_segments, 1))
+        self._extras: dict[str, Tensor] = {}
+        self._place(given)
+        self._poses_unknown = self.task.drive.weld is not None and "weld_pose" not in given
+
+    @property
+    def models(self) -> ModelBatch:
+        """The physics, one row per parameter vector."""
+        return self._stepper.models
+
+    @property
+    def batch_size(self) -> torch.Size:
+        """The number of parameter vectors that there is room for; it grows as needed."""
+        return torch.Size([self.models.num_envs])
+
+    def __call__(
+        self, theta: Tensor | None = None, *, hook: Hook | None = None, every: str = "control"
+    ) -> TensorDict:
+        """Simulate all segments under every parameter vector.
+
+        Args:
+            theta: Parameter vectors, shape ``(P, D)``; default the physics in force.
+            hook: What the simulator leaves out.
+            every: Call the hook before every ``control`` step, or before every ``time`` step.
+
+        Returns:
+            The outputs after each action, batch size ``(P, S, T)``, in double precision; NaN from
+            a divergence on.
+
+        Raises:
+            ValueError: ``theta`` has another shape or no ``physics`` to set; ``every`` is unknown.
+        """
+        count = 1 if theta is None else self._write(theta)
+        rows = np.arange(count * self.num_segments)
+        stepper = self._stepper
+        stepper.state.reshape(-1, *self._starts.shape)[:count] = self._starts
+        if self._poses_unknown:
+            stepper.begin(rows)
+        outputs = np.empty((len(rows), self.steps, stepper.output_size))
+        if hook is not None:
+            self._hooked(hook, every, rows, outputs)
+        else:
+            sequence = rows % self.num_segments
+            substeps = self.task.frame_skip
+            stepper.rollout(
+                self._commands, substeps=substeps, sequence=sequence, rows=rows, outputs=outputs
+            )
+        return self._collect(outputs.reshape(count, self.num_segments, self.steps, -1))
+
+    def _write(self, theta: Tensor) -> int:
+        if self.physics is None or theta.ndim != 2 or theta.shape[1] != len(self.physics.names):
+            names = () if self.physics is None else self.physics.names
+            expected = f"theta of shape (P, {len(names)}) for the parameters {names}"
+            raise ValueError(message(expected, tuple(theta.shape), hint="pass physics"))
+        count = len(theta)
+        if count > self.models.num_envs:
+            self._stepper.resize(count * self.num_segments)
+        room = self.models.num_envs
+        mask = torch.arange(room) < count
+        padded = torch.cat([theta, theta[-1:].expand(room - count, -1)])
+        anything: Any = self  # what physics needs of an environment are its models
+        empty = TensorDict(batch_size=self.batch_size)
+        self.physics.write(anything, padded, mask=mask, tensordict=empty)
+        return count
+
+    def _hooked(
+        self, hook: Hook, every: str, rows: NDArray[np.int64], outputs: NDArray[np.float64]
+    ) -> None:
+        """Step one command at a time, with the hook between."""
+        parts = {"control": 1, "time": self.task.frame_skip}.get(every)
+        if parts is None or (parts > 1 and self._commands.shape[2] != self.task.model.nu):
+            expected = "every='control', or 'time' for a task whose commands are its controls"
+            raise ValueError(message(expected, every))
+        stepper, batch = self._stepper, (-1, self.num_segments)
+        command = np.empty((stepper.num_envs, 1, self._commands.shape[2]))
+        readings = Readings()
+        for name in stepper.components:
+            tensor = torch.from_numpy(stepper[name][: len(rows)])
+            setattr(readings, name, tensor.unflatten(0, batch))
+        control = torch.from_numpy(command[: len(rows), 0, : self.task.model.nu])
+        readings.ctrl = control.unflatten(0, batch)
+        outputs[:] = np.nan
+        for t in range(self.steps):
+            for _ in range(parts):
+                command[: len(rows), 0].reshape(-1, *self._commands[:, t].shape)[:] = (
+                    self._commands[:, t]
+                )
+                for name, value in hook(readings).items():
+                    getattr(readings, name).copy_(value)
+                stepper.rollout(
+                    command,
+                    substeps=self.task.frame_skip // parts,
+                    rows=rows,
+                    outputs=stepper.outputs,
+                )
+                rows = rows[stepper.status[rows] == 0]
+            outputs[rows, t] = stepper.outputs[rows, 0]
+
+    def _place(self, given: Mapping[str, Tensor]) -> None:
+        components = self._stepper.components
+        reset = self.task.reset
+        own = {} if reset is None else reset(Draws(0, np.zeros(1, int), np.zeros(1, int)))
+        for name, value in {**self.task.initial, **given}.items():
+            if name in components:
+                self._starts[:, components[name]] = value
+            elif name in own:
+                self._extras[name] = torch.as_tensor(value).unsqueeze(1)
+            elif name != "action":
+                available = [*components, *own, "action"]
+                raise KeyError(message("a component of the state", name, available=available))
+
+    def _collect(self, outputs: NDArray[np.float64]) -> TensorDict:
+        view = self._stepper.view
+        read = {name: torch.from_numpy(view(outputs, name)) for name in self._stepper.layout}
+        result = {name: read[name] for name in self._names if name != "observation"}
+        if "observation" in self._names:
+            observed = self.task.observation(Readings(**read, **self._extras))
+            result |= observed if isinstance(observed, dict) else {"observation": observed}
+        return TensorDict(result, batch_size=outputs.shape[:3])
+
+
+def replay(
+    task: str | Task,
+    segments: Mapping[str, Tensor],
+    theta: Tensor | None = None,
+    *,
+    physics: Physics | None = None,
+    outputs: tuple[str, ...] = ("qpos", "qvel"),
+    hook: Hook | None = None,
+) -> TensorDict:
+    """Simulate segments once under every parameter vector; see `Replay` for the arguments.
+
+    Example:
+        >>> still = {"qpos": torch.zeros(1, 2), "qvel": torch.zeros(1, 2)}
+        >>> y = replay("InvertedPendulum-v5", {**still, "action": torch.ones(1, 5, 1)})
+        >>> bool((y["qpos"][0, 0, :, 0].diff() > 0).all())  # the cart goes the way it is pushed
+        True
+    """
+    return Replay(task, segments, physics=physics, outputs=outputs)(theta, hook=hook)
+
+
+def _checked(given: Mapping[str, Tensor]) -> Tensor:
+    """Return the actions of segments that are fit to be replayed."""
+    missing = [name for name in ("qpos", "qvel", "action") if name not in given]
+    if missing:
+        raise ValueError(message("segments with qpos, qvel and action", sorted(given)))
+    action = given["action"]
+    if action.ndim != 3:
+        raise ValueError(message("actions of shape (S, T, A)", tuple(action.shape)))
+    for name, value in given.items():
+        if len(value) != len(action) or not value.isfinite().all():
+            expected = f"finite numbers for {len(action)} segments in {name!r}"
+            raise ValueError(message(expected, tuple(value.shape)))
+    return action
