@@ -12,6 +12,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
+from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
 from torchrl_bayessim.errors import PhysicsError
 from torchrl_bayessim.physics.attributes import AttributePhysics
 from torchrl_bayessim.sources import Empirical, Grid
@@ -126,6 +127,25 @@ def test_explicit_reset_with_a_running_tensordict_draws_anew(env):
     again = env.reset(td.clone())
     assert (again["theta"] != td["theta"]).all()
     assert_simulator_holds_theta(again)
+
+
+def test_a_batched_simulator_holds_theta_at_every_step_and_resets_only_rows():
+    base = CartPoleEnv(5)
+    writer = ApplyPhysics(AttributePhysics(*NAMES))
+    env = TransformedEnv(base, Compose(writer, DomainRandomizer(Uniform()), StepCounter(30)))
+    check_env_specs(env)
+    td, changes = env.reset(), 0
+    for _ in range(80):
+        held = torch.stack([base.parameters[name] for name in NAMES], -1)
+        torch.testing.assert_close(td["theta"], held.float(), rtol=0, atol=0)
+        stepped, after = env.step_and_maybe_reset(env.rand_action(td))
+        assert torch.equal(stepped["next", "theta"], td["theta"])
+        changed = (after["theta"] != td["theta"]).any(-1, keepdim=True)
+        assert torch.equal(changed, stepped["next", "done"])
+        changes += changed.sum()
+        td = after
+    assert changes > 5
+    assert len(td["theta"].unique(dim=0)) == 5
 
 
 @pytest.mark.parametrize("kind", ["serial", "parallel"])

@@ -269,7 +269,7 @@ class DomainRandomizer(Transform):
         env = _simulator(self.parent)
         if self._checked or (isinstance(env, SerialEnv | ParallelEnv) and env.is_closed):
             return
-        found = env.physics_names()
+        found = getattr(env, "physics_names", dict)()
         for known in found if isinstance(found, list) else [found]:
             if self.names is not None and known.get(self.key, self.names) != self.names:
                 raise PhysicsError(

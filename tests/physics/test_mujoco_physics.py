@@ -308,3 +308,18 @@ def test_batched_environments_differ_and_partial_resets_write_only_theirs():
     nominal = env.base_env.models.model
     expected = nominal.body_inertia[1, 0] * held[:, 0].numpy() / nominal.body_mass[1]
     np.testing.assert_allclose(inertia, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["FetchPush-v4", "FetchSlide-v4"])
+def test_friction_of_both_geoms_is_the_friction_of_their_contact(name):
+    """MuJoCo takes the maximum: setting one geom alone would leave the other's value."""
+    env = TransformedEnv(GymEnv(name), ApplyPhysics(MujocoPhysics(**FETCH)))
+    fetch = env.unwrapped
+    table = fetch.model.body("table0").id
+    for friction in (0.25, 0.6, 0.05):
+        env.reset(TensorDict(theta=torch.tensor([friction])))
+        env.rand_step(env.reset(TensorDict(theta=torch.tensor([friction]))))
+        bodies = fetch.model.geom_bodyid[fetch.data.contact.geom]
+        between = (bodies == table).any(1) & (bodies == fetch.model.body("object0").id).any(1)
+        assert between.any()
+        np.testing.assert_allclose(fetch.data.contact.friction[between, 0], friction, rtol=1e-6)

@@ -183,7 +183,8 @@ def _array(model: mujoco.MjModel, field: str) -> NDArray[np.float64]:
 
 def _models(env: Any) -> _Models:
     """Return the environment's models, noted on the environment itself."""
-    batch = getattr(env, "models", None)
+    # not getattr: TorchRL's looks through hundreds of names for what is missing
+    batch = env.models if hasattr(type(env), "models") else None
     model = _model(env) if batch is None else batch.model
     known = env.__dict__.get("_mujoco_models")
     if known is None or known.model is not model:
