@@ -27,7 +27,7 @@ class Source(Protocol):
     """
 
     # *_ and **_ leave room for the generator and for what a library adds to its own `sample`
-    def sample(self, shape: torch.Size, *_: Any, **__: Any) -> Tensor:
+    def sample(self, shape: torch.Size, /, *_: Any, **__: Any) -> Tensor:
         """Return independent draws, shape ``(*shape, D)``."""
         ...
 
@@ -115,6 +115,13 @@ class Defensive:
         theta = draw(self.source, count, key=(key, "source"))
         theta[from_prior] = draw(self.prior, count, key=(key, "prior"))[from_prior]
         return theta.reshape(*shape, -1)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return the mixture's log-density, shape ``(*)``; both parts must have one."""
+        parts: list[Any] = [self.source, self.prior]
+        weights = torch.tensor([1 - self.weight, self.weight]).log()
+        terms = [p.log_prob(value) + w for p, w in zip(parts, weights, strict=True)]
+        return torch.logaddexp(*terms)
 
 
 class Empirical:

@@ -18,6 +18,7 @@ from typing import Literal
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
+from torch import Tensor
 from torchrl.objectives.common import LossModule
 
 from ..errors import message
@@ -28,7 +29,8 @@ class PosteriorLoss(LossModule):
 
     Args:
         posterior_network: A posterior with ``get_dist`` such as ``MixtureDensityPosterior``.
-        reduction: ``"mean"`` (weighted), ``"sum"`` or ``"none"``.
+        reduction: ``"mean"`` (weighted), ``"sum"`` (weighted), or ``"none"``: one value per pair,
+            without weights and masks.
 
     Keys (change with ``set_keys``): ``theta`` the parameters ``(*, D)``, ``weight`` importance
     weights ``(*)``, used where present; ``mask`` booleans ``(*)``, used where present.
@@ -77,20 +79,26 @@ class PosteriorLoss(LossModule):
     @dispatch  # pyright: ignore[reportArgumentType]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``{"loss_posterior": ...}`` for pairs of summaries and parameters."""
-        keys = self.tensor_keys
+        theta = tensordict.get(self.tensor_keys.theta)
+        inputs = tensordict.select(*self.posterior_network.in_keys)
+        weight = self._weight(tensordict, theta)
+        used = weight > 0
+        if self.reduction != "none" and not used.all():
+            # a row of weight 0 may hold anything; NaN there would reach the gradient as 0 * NaN
+            inputs = inputs.apply(lambda x: torch.where(used.unsqueeze(-1), x, 0.0))
         with self.posterior_network_params.to_module(self.posterior_network):
-            inputs = tensordict.select(*self.posterior_network.in_keys)
-            distribution = self.posterior_network.get_dist(inputs)
-        loss = -distribution.log_prob(tensordict.get(keys.theta))
+            loss = -self.posterior_network.get_dist(inputs).log_prob(theta)
         if self.reduction == "none":
             return TensorDict({"loss_posterior": loss})
-        weight = tensordict.get(keys.weight, None)
-        weight = torch.ones_like(loss) if weight is None else weight.reshape(loss.shape)
-        mask = tensordict.get(keys.mask, None)
-        if mask is not None:
-            weight = torch.where(mask.reshape(loss.shape), weight, 0.0)
-        # a row of weight 0 may hold anything, NaN included
-        total = torch.where(weight > 0, weight * loss, 0.0).sum()
+        total = torch.where(used, weight * loss, 0.0).sum()
         if self.reduction == "mean":
             total = total / weight.sum().clamp_min(1e-12)
         return TensorDict({"loss_posterior": total})
+
+    def _weight(self, tensordict: TensorDictBase, theta: Tensor) -> Tensor:
+        """Return the weight of every pair, 0 where masked."""
+        shape = theta.shape[:-1]
+        weight = tensordict.get(self.tensor_keys.weight, None)
+        weight = theta.new_ones(shape) if weight is None else weight.reshape(shape)
+        mask = tensordict.get(self.tensor_keys.mask, None)
+        return weight if mask is None else torch.where(mask.reshape(shape), weight, 0.0)

@@ -120,15 +120,14 @@ def divide(
     .. math::
         \Sigma'_k = (\Sigma_k^{-1} - \Sigma_0^{-1})^{-1}, \quad
         \mu'_k = \Sigma'_k (\Sigma_k^{-1} \mu_k - \Sigma_0^{-1} \mu_0), \quad
-        \log\alpha'_k = \log\alpha_k - \tfrac12 \lambda_k,
+        \alpha'_k = \alpha_k \frac{N(\theta; \mu_k, \Sigma_k)}
+        {N(\theta; \mu_0, \Sigma_0)\, N(\theta; \mu'_k, \Sigma'_k)}
 
-    with :math:`\lambda_k = \log\frac{|\Sigma_k|}{|\Sigma_0||\Sigma'_k|} +
-    \mu_k^T\Sigma_k^{-1}\mu_k - \mu_0^T\Sigma_0^{-1}\mu_0 - \mu_k'^T\Sigma_k'^{-1}\mu'_k`
-    (arXiv:1605.06376, appendix C; the BayesSim paper prints :math:`\Sigma_k^{-1}` for
-    :math:`\Sigma'_k` in the mean, a misprint). The precision is indefinite wherever a component
-    is wider than the divisor: there its eigenvalues are raised to ``1 / max_variance`` and the
-    component is counted as repaired. A *mixture* divisor has no such formula; dividing by it
-    component by component is wrong.
+    at any :math:`\theta`, here at :math:`\mu_k` (arXiv:1605.06376, appendix C; the BayesSim paper
+    prints :math:`\Sigma_k^{-1}` for :math:`\Sigma'_k` in the mean, a misprint). The precision is
+    indefinite wherever a component is wider than the divisor: there its eigenvalues are raised to
+    ``1 / max_variance``, its mean stays where it was, and the component is counted as repaired. A
+    *mixture* divisor has no such formula; dividing by it component by component is wrong.
 
     Args:
         mixture: The dividend, in standardised coordinates.
@@ -145,23 +144,22 @@ def divide(
         8.0
     """
     precision = torch.cholesky_inverse(mixture.scale_tril)
-    precision_0 = torch.linalg.inv(covariance)
-    shift = (precision @ mixture.loc.unsqueeze(-1)).squeeze(-1)
-    shift_0 = (precision_0 @ mean.unsqueeze(-1)).squeeze(-1)
-    values, vectors = torch.linalg.eigh(_symmetric(precision - precision_0.unsqueeze(-3)))
+    precision_0 = torch.linalg.inv(covariance).unsqueeze(-3)
+    shift = precision @ mixture.loc.unsqueeze(-1) - precision_0 @ mean[..., None, :, None]
+    values, vectors = torch.linalg.eigh(_symmetric(precision - precision_0))
     bad = values < 1 / max_variance
     values = torch.where(bad, 1 / max_variance, values)
-    new_covariance = _symmetric(vectors @ ((1 / values).unsqueeze(-1) * vectors.mT))
-    combined = shift - shift_0.unsqueeze(-2)
-    loc = (new_covariance @ combined.unsqueeze(-1)).squeeze(-1)
-    log_det = 2 * mixture.scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    log_det_ratio = log_det - torch.logdet(covariance).unsqueeze(-1) + values.log().sum(-1)
-    energy = (mixture.loc * shift).sum(-1) - (mean * shift_0).sum(-1).unsqueeze(-1)
-    lam = log_det_ratio + energy - (loc * combined).sum(-1)
-    quotient = Mixture(
-        (mixture.logits - 0.5 * lam).log_softmax(-1), loc, torch.linalg.cholesky(new_covariance)
-    )
-    return Division(quotient, int(bad.any(-1).sum()))
+    # a mean far away, and with it an enormous weight, would be read off a badly known difference
+    stay = vectors.mT @ mixture.loc.unsqueeze(-1)
+    solved = (vectors.mT @ shift) / values.unsqueeze(-1)
+    loc = (vectors @ torch.where(bad.unsqueeze(-1), stay, solved)).squeeze(-1)
+    scale = torch.linalg.cholesky(_symmetric(vectors @ (vectors / values.unsqueeze(-2)).mT))
+    own = -mixture.scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    scale_0 = torch.linalg.cholesky(covariance)[..., None, None, :, :]
+    divisor = component_log_prob(mixture.loc, mean[..., None, None, :], scale_0).squeeze(-1)
+    raised = component_log_prob(mixture.loc, loc.unsqueeze(-2), scale.unsqueeze(-3)).squeeze(-1)
+    logits = (mixture.logits + own - divisor - raised).log_softmax(-1)
+    return Division(Mixture(logits, loc, scale), int(bad.any(-1).sum()))
 
 
 def reduce(mixture: Mixture, components: int) -> Mixture:
@@ -174,31 +172,35 @@ def reduce(mixture: Mixture, components: int) -> Mixture:
     """
     logits, order = mixture.logits.log_softmax(-1).sort(descending=True)
     keep = max(1, int((logits.exp().flip(0).cumsum(0).flip(0) > 1e-9).sum()))
-    weight = logits[:keep].exp()
-    loc, cov = mixture.loc[order[:keep]], mixture.covariance[order[:keep]]
-    while weight.numel() > components:
-        i, j = _cheapest_merge(weight, loc, cov)
-        pair = Mixture(weight[[i, j]].log(), loc[[i, j]], torch.linalg.cholesky(cov[[i, j]]))
-        mean, covariance = moment_match(pair)
-        rest = [k for k in range(weight.numel()) if k not in {i, j}]
-        loc = torch.cat([loc[rest], mean[None]])
-        cov = torch.cat([cov[rest], covariance[None]])
-        weight = torch.cat([weight[rest], (weight[i] + weight[j])[None]])
+    parts = (logits[:keep].exp(), mixture.loc[order[:keep]], mixture.covariance[order[:keep]])
+    cost = _merge_cost(parts, parts).fill_diagonal_(torch.inf)
+    while len(cost) > components:
+        i, j = divmod(int(cost.argmin()), len(cost))
+        merged = _merge(*(part[[i, j]] for part in parts))
+        rest = [k for k in range(len(cost)) if k not in {i, j}]
+        parts = tuple(part[rest] for part in parts)
+        row = _merge_cost(merged, parts)
+        corner = torch.full_like(row[:, :1], torch.inf)
+        cost = torch.cat([torch.cat([cost[rest][:, rest], row.mT], 1), torch.cat([row, corner], 1)])
+        parts = tuple(torch.cat([part, new]) for part, new in zip(parts, merged, strict=True))
+    weight, loc, cov = parts
     return Mixture(weight.log().log_softmax(-1), loc, torch.linalg.cholesky(cov))
 
 
-def _cheapest_merge(weight: Tensor, loc: Tensor, cov: Tensor) -> tuple[int, int]:
-    total = weight[:, None] + weight[None]
-    share = weight[:, None] / total
-    between = loc[:, None] - loc[None]
-    outer = (share * (1 - share))[..., None, None] * between[..., None] * between[..., None, :]
-    merged = share[..., None, None] * cov[:, None] + (1 - share)[..., None, None] * cov[None]
-    log_det = torch.logdet(cov)
-    cost = total * torch.logdet(merged + outer)
-    cost = cost - weight[:, None] * log_det[:, None] - weight[None] * log_det[None]
-    cost = cost + torch.diag(torch.full_like(weight, torch.inf))
-    flat = int(cost.argmin())
-    return flat // weight.numel(), flat % weight.numel()
+def _merge(weight: Tensor, loc: Tensor, cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    mean, covariance = moment_match(Mixture(weight.log(), loc, torch.linalg.cholesky(cov)))
+    return weight.sum(0, keepdim=True), mean[None], covariance[None]
+
+
+def _merge_cost(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> Tensor:
+    """Return the bound for every pair of two sets of components, shape ``(K1, K2)``."""
+    weight, loc, cov = (part[:, None] for part in first)
+    total = weight + second[0]
+    share = (weight / total)[..., None, None]
+    between = loc - second[1]
+    outer = share * (1 - share) * between[..., None] * between[..., None, :]
+    cost = total * torch.logdet(share * cov + (1 - share) * second[2] + outer)
+    return cost - weight * torch.logdet(cov) - second[0] * torch.logdet(second[2])
 
 
 def _symmetric(matrix: Tensor) -> Tensor:

@@ -44,6 +44,8 @@ def pool(each: TruncatedGaussianMixture, *, bounded: bool) -> TruncatedGaussianM
     for factor in factors[1:]:
         product = multiply(product, factor)
         if not bounded:
-            product = divide(product, torch.zeros_like(identity[0]), identity).mixture
+            # no component of a posterior is wider than the prior
+            zero = torch.zeros_like(identity[0])
+            product = divide(product, zero, identity, max_variance=1.0).mixture
         product = reduce(product, MAX_COMPONENTS)
     return TruncatedGaussianMixture.restrict(*product, each.box, diagonal=False)

@@ -60,10 +60,7 @@ class Standardization(Transform):
         return torch.where(self.log, u.exp(), u) if self.log.any() else u
 
     def _inverse(self, y: Tensor) -> Tensor:
-        u = y
-        if self.log.any():
-            positive = torch.where(self.log, y.clamp_min(torch.finfo(y.dtype).tiny), 1.0)
-            u = torch.where(self.log, positive.log(), y)
+        u = torch.where(self.log, self._log(y), y) if self.log.any() else y
         centred = (u - self.mean.to(y.dtype)).unsqueeze(-1)
         scale = self.scale_tril.to(y.dtype)
         return torch.linalg.solve_triangular(scale, centred, upper=False).squeeze(-1)
@@ -73,7 +70,11 @@ class Standardization(Transform):
         volume = self.scale_tril.diagonal().log().sum().to(x.dtype)
         if not self.log.any():
             return volume.expand(x.shape[:-1])
-        return volume + torch.where(self.log, y, torch.ones_like(y)).log().sum(-1)
+        return volume + self._log(y).sum(-1)
+
+    def _log(self, y: Tensor) -> Tensor:
+        """Return the logarithm of logarithmic parameters, finite below 0, and 0 for others."""
+        return torch.where(self.log, y.clamp_min(torch.finfo(y.dtype).tiny), 1.0).log()
 
 
 class Prior(Distribution):
@@ -128,7 +129,7 @@ class BoxPrior(Prior):
 
     .. math::
         \log p(\theta) = -\sum_d \log(h_d - l_d)
-        \quad\text{or}\quad -\sum_d \log\theta_d + \log\log(h_d / l_d) \text{ if logarithmic,}
+        \quad\text{or}\quad -\sum_d (\log\theta_d + \log\log(h_d / l_d)) \text{ if logarithmic,}
 
     and :math:`-\infty` outside.
 
@@ -214,8 +215,10 @@ class BoxPrior(Prior):
     def contains(self, theta: Tensor) -> Tensor:
         """Return which parameters lie in the box (up to rounding), boolean, shape ``(*)``."""
         self._check_event(theta)
-        slack = 1e-6 * (self.high - self.low)
-        return ((theta >= self.low - slack) & (theta <= self.high + slack)).all(-1)
+        width = self.high - self.low
+        below = 1e-6 * torch.where(self.log, self.low, width)
+        above = 1e-6 * torch.where(self.log, self.high, width)
+        return ((theta >= self.low - below) & (theta <= self.high + above)).all(-1)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-density, ``-inf`` outside the box, shape ``(*)``."""

@@ -39,11 +39,11 @@ def _mirror(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return flip, torch.where(flip, -b, a), torch.where(flip, -a, b)
 
 
-def _log_ratio(low: Tensor, high: Tensor) -> Tensor:
+def _log_ratio(low: Tensor, high: Tensor, log_high: Tensor) -> Tensor:
     r"""Return :math:`\log\Phi(l) - \log\Phi(h)`, negative, for mirrored limits."""
     # far out log Phi is about -x^2 / 2, whose difference must be formed before it is rounded away
     tail = 0.5 * (high - low) * (high.clamp(max=-1.0) + low)
-    near = torch.special.log_ndtr(low) - torch.special.log_ndtr(high)
+    near = torch.special.log_ndtr(low) - log_high
     return torch.where(high < -1e3, tail, near).clamp(max=-1e-12)
 
 
@@ -58,9 +58,10 @@ class _LogInterval(torch.autograd.Function):
     @staticmethod
     def forward(ctx: FunctionCtx, a: Tensor, b: Tensor) -> Tensor:
         flip, low, high = _mirror(a, b)
-        log_ratio = _log_ratio(low, high)
+        log_high = torch.special.log_ndtr(high)
+        log_ratio = _log_ratio(low, high, log_high)
         ctx.save_for_backward(flip, low, high, log_ratio)
-        return torch.special.log_ndtr(high) + torch.log(-torch.expm1(log_ratio))
+        return log_high + torch.log(-torch.expm1(log_ratio))
 
     @staticmethod
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor]:
@@ -81,8 +82,8 @@ class _TruncatedQuantile(torch.autograd.Function):
     def forward(ctx: FunctionCtx, a: Tensor, b: Tensor, u: Tensor) -> Tensor:
         flip, low, high = _mirror(a, b)
         v = torch.where(flip, 1 - u, u)
-        # exp(log_ndtr) because torch.special.ndtr is 0 below -8.3
-        mass_low, mass_high = (torch.special.log_ndtr(x).exp() for x in (low, high))
+        # erfc because torch.special.ndtr is 0 below -8.3
+        mass_low, mass_high = (0.5 * torch.erfc(-x / math.sqrt(2)) for x in (low, high))
         body = torch.special.ndtri((mass_low + v * (mass_high - mass_low)).clamp(1e-290, 1 - 1e-16))
         # beyond 30 deviations Phi underflows; there the density is exponential to 1 part in 900
         rate = high.clamp(max=-1.0).abs()
@@ -98,7 +99,7 @@ class _TruncatedQuantile(torch.autograd.Function):
         a, b, u, y = ctx.saved_tensors
         d_a = (1 - u) * (0.5 * (y - a) * (y + a)).clamp(max=50.0).exp()
         d_b = u * (0.5 * (y - b) * (y + b)).clamp(max=50.0).exp()
-        return grad * d_a, grad * d_b, None
+        return (grad * d_a).sum_to_size(a.shape), (grad * d_b).sum_to_size(b.shape), None
 
 
 def _hazard(x: Tensor) -> Tensor:
@@ -112,13 +113,31 @@ def log_interval(a: Tensor, b: Tensor) -> Tensor:
 
 def truncated_quantile(a: Tensor, b: Tensor, u: Tensor) -> Tensor:
     r"""Return the ``u``-quantile of a standard normal restricted to :math:`[a, b]`."""
-    return _TruncatedQuantile.apply(*torch.broadcast_tensors(a, b, u))
+    return _TruncatedQuantile.apply(*torch.broadcast_tensors(a, b), u)
 
 
 @lru_cache(maxsize=32)
 def _points(dimension: int, count: int) -> Tensor:
     engine = torch.quasirandom.SobolEngine(dimension, scramble=True, seed=0)
     return engine.draw(count, dtype=torch.float64).clamp(1e-12, 1 - 1e-12)
+
+
+def _chain(
+    loc: Tensor, scale_tril: Tensor, box: tuple[Tensor, Tensor], u: Tensor
+) -> tuple[list[Tensor], Tensor]:
+    """Return the noise of as many coordinates as ``u`` has columns, and the log of the product."""
+    noise: list[Tensor] = []
+    log_weight = torch.zeros((), dtype=loc.dtype)
+    for d in range(loc.shape[-1]):
+        shift = loc[..., d]
+        if noise:
+            shift = shift + (scale_tril[..., d, :d] * torch.stack(noise, -1)).sum(-1)
+        scale = scale_tril[..., d, d]
+        a, b = (box[0][d] - shift) / scale, (box[1][d] - shift) / scale
+        log_weight = log_weight + log_interval(a, b)
+        if d < u.shape[-1]:
+            noise.append(truncated_quantile(a, b, u[..., d]))
+    return noise, log_weight
 
 
 def separate(
@@ -135,16 +154,7 @@ def separate(
     Returns:
         Points of shape ``(*, D)`` and the log-weight of each, shape ``(*)``.
     """
-    noise: list[Tensor] = []
-    log_weight = torch.zeros((), dtype=loc.dtype)
-    for d in range(loc.shape[-1]):
-        shift = loc[..., d]
-        if noise:
-            shift = shift + (scale_tril[..., d, :d] * torch.stack(noise, -1)).sum(-1)
-        scale = scale_tril[..., d, d]
-        a, b = (box[0][d] - shift) / scale, (box[1][d] - shift) / scale
-        log_weight = log_weight + log_interval(a, b)
-        noise.append(truncated_quantile(a, b, u[..., d]))
+    noise, log_weight = _chain(loc, scale_tril, box, u)
     point = loc + (scale_tril @ torch.stack(noise, -1).unsqueeze(-1)).squeeze(-1)
     # the first limits do not depend on u, so with D = 1 the weight has no points' axis yet
     return torch.minimum(torch.maximum(point, box[0]), box[1]), log_weight.expand(point.shape[:-1])
@@ -169,8 +179,9 @@ def log_mass(
         scale = scale_tril.diagonal(dim1=-2, dim2=-1)
         return log_interval((box[0] - loc) / scale, (box[1] - loc) / scale).sum(-1)
     u = _points(loc.shape[-1], points).reshape(points, *[1] * (loc.ndim - 1), -1)
-    _, log_weight = separate(loc.unsqueeze(0), scale_tril.unsqueeze(0), box, u)
-    return log_weight.logsumexp(0) - math.log(points)
+    # no limit depends on the last coordinate
+    _, log_weight = _chain(loc.unsqueeze(0), scale_tril.unsqueeze(0), box, u[..., :-1])
+    return log_weight.logsumexp(0) - math.log(len(log_weight))
 
 
 class TruncatedGaussianMixture(Distribution):
@@ -283,7 +294,7 @@ class TruncatedGaussianMixture(Distribution):
             index = torch.multinomial(
                 flat.exp(), max(count, 1), replacement=True, generator=generator
             )
-            index = index.T.reshape(*shape, *self.batch_shape) if count else index[:, :0]
+            index = index.T[:count].reshape(*shape, *self.batch_shape)
             loc = self._pick(self.loc, index, 1)
             scale = self._pick(self.scale_tril, index, 2)
             return self._metropolis(loc, scale, generator)

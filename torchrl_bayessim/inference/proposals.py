@@ -1,0 +1,202 @@
+r"""Simulating where the posterior is, and correcting for it.
+
+Pairs drawn from a proposal :math:`\tilde p(\theta)` instead of the prior would teach the network
+:math:`\tilde p(\theta \mid x)`. Three corrections, the first two right for any proposal:
+
+* ``"importance"``: weights :math:`w = p(\theta) / \tilde p(\theta)` in the loss, with
+  :math:`\tilde p = \sum_r \tfrac{n_r}{N} \tilde p_r` over all rounds (the balance heuristic, Veach
+  & Guibas, 1995). If the prior is part of every proposal, the weights are bounded.
+* ``"truncated"``: the prior restricted to the posterior's highest-density region, so that weights
+  are constant within every region (Deistler et al., 2022, arXiv:2210.04815).
+* ``"analytic"``: the BayesSim paper's division of the learned mixture by a Gaussian proposal
+  (arXiv:1906.01728, eq. 14). Only for one Gaussian: see :func:`.mixtures.divide`.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "HighestDensityPrior",
+    "analytic_correction",
+    "effective_sample_size",
+    "gaussian_proposal",
+    "importance_weights",
+]
+
+import math
+import warnings
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from ..errors import SimulationError, message
+from ..sources import draw
+from .mixtures import Mixture, divide, multiply
+from .posterior import PhysicsPosterior
+from .priors import Prior
+from .truncation import TruncatedGaussianMixture
+
+
+class Proposal(Protocol):
+    """A source whose density is known."""
+
+    def sample(self, shape: torch.Size, /, *_: Any, **__: Any) -> Tensor:
+        """Return draws of shape ``(*shape, D)``."""
+        ...
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log-density, shape ``(*)``."""
+        ...
+
+
+def importance_weights(
+    theta: Tensor, prior: Prior, proposals: Sequence[tuple[Proposal, int]]
+) -> Tensor:
+    r"""Return :math:`p(\theta) / \sum_r \tfrac{n_r}{N} \tilde p_r(\theta)`, shape ``(N,)``.
+
+    Args:
+        theta: Parameters of all rounds together, shape ``(N, D)``.
+        prior: The prior p.
+        proposals: ``(proposal, number of draws)`` of every round.
+
+    Raises:
+        ValueError: If a parameter has density zero under every proposal.
+
+    Example:
+        >>> from torchrl_bayessim.inference.priors import BoxPrior
+        >>> prior, half = BoxPrior({"a": (0.0, 1.0)}), BoxPrior({"a": (0.0, 0.5)})
+        >>> importance_weights(torch.tensor([[0.2], [0.8]]), prior, [(prior, 100), (half, 100)])
+        tensor([0.6667, 2.0000])
+    """
+    total = sum(count for _, count in proposals)
+    terms = [p.log_prob(theta) + math.log(count / total) for p, count in proposals if count]
+    log_density = torch.stack(terms).logsumexp(0)
+    if not log_density.isfinite().all():
+        bad = theta[~log_density.isfinite()][0].tolist()
+        raise ValueError(message("parameters drawn from the proposals", f"{bad}, of density 0"))
+    return (prior.log_prob(theta) - log_density).exp()
+
+
+def effective_sample_size(weights: Tensor) -> float:
+    r"""Return :math:`(\sum w)^2 / \sum w^2`: how many equal weights these are worth (Kish, 1965).
+
+    Example:
+        >>> effective_sample_size(torch.tensor([1.0, 1.0, 0.0]))
+        2.0
+    """
+    return (weights.sum().square() / weights.square().sum().clamp_min(1e-30)).item()
+
+
+class HighestDensityPrior:
+    r"""The prior restricted to :math:`\{\theta : q(\theta) \geq c\}`, which holds ``mass`` of q.
+
+    Args:
+        prior: The prior to restrict.
+        posterior: Whose highest-density region is used.
+        mass: Probability of the region under the posterior.
+        seed: Of the estimates of the threshold c and of the region's prior volume.
+        tries: At most so many batches of prior draws per sample; then draws of the posterior
+            within the region fill the rest, with a warning.
+    """
+
+    def __init__(
+        self,
+        prior: Prior,
+        posterior: PhysicsPosterior,
+        *,
+        mass: float = 0.9999,
+        seed: int = 0,
+        tries: int = 64,
+    ) -> None:
+        self.prior, self.posterior, self.tries = prior, posterior, tries
+        self.names = prior.names
+        draws = draw(posterior, 8192, key=(seed, "region"))
+        self.threshold = posterior.log_prob(draws).quantile(1 - mass).item()
+        inside = self.contains(draw(prior, 65536, key=(seed, "volume")))
+        # half a point keeps a region smaller than the sample from having volume zero
+        self.log_volume = math.log((inside.sum().item() + 0.5) / (len(inside) + 0.5))
+
+    def contains(self, theta: Tensor) -> Tensor:
+        """Return which parameters lie in the region, boolean, shape ``(*)``."""
+        return self.posterior.log_prob(theta) >= self.threshold
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log-density, ``-inf`` outside the region, shape ``(*)``."""
+        log_density = self.prior.log_prob(value) - self.log_volume
+        return torch.where(self.contains(value), log_density, -torch.inf)
+
+    def sample(self, shape: torch.Size, *, generator: torch.Generator) -> Tensor:
+        """Return draws of shape ``(*shape, D)``: the prior's that fall in the region."""
+        count = torch.Size(shape).numel()
+        kept: list[Tensor] = []
+        missing = count
+        for source in [self.prior] * self.tries + [self.posterior] * self.tries:
+            if missing <= 0:
+                break
+            if source is self.posterior and len(kept) == self.tries:
+                warnings.warn("the region is too small for prior draws: used q's", stacklevel=2)
+            theta = source.sample((max(4 * count, 256),), generator=generator)  # pyright: ignore[reportCallIssue]
+            kept.append(theta[self.contains(theta)])
+            missing -= len(kept[-1])
+        if missing > 0:
+            raise SimulationError(message("draws inside the region", f"{count - missing}"))
+        return torch.cat(kept)[:count].reshape(*shape, -1)
+
+
+def gaussian_proposal(posterior: PhysicsPosterior, *, inflate: float = 1.5) -> PhysicsPosterior:
+    """Project a posterior onto one Gaussian by its moments, and widen its deviations.
+
+    The one proposal that :func:`analytic_correction` may divide by. It is not truncated.
+    """
+    points, weight = posterior.mixture.quadrature()
+    mean = (weight.unsqueeze(-1) * points).sum(0)
+    centred = points - mean
+    covariance = (weight[:, None, None] * centred[:, :, None] * centred[:, None, :]).sum(0)
+    scale = inflate * torch.linalg.cholesky(covariance + 1e-10 * torch.eye(len(mean)))
+    one = TruncatedGaussianMixture(
+        torch.zeros(1), mean[None], scale[None], posterior.prior.box, diagonal=False
+    )
+    return PhysicsPosterior(one, posterior.prior)
+
+
+def analytic_correction(
+    learned: PhysicsPosterior, proposal: PhysicsPosterior
+) -> tuple[PhysicsPosterior, int]:
+    r"""Return :math:`\propto q(\theta \mid x)\, p(\theta) / \tilde p(\theta)` and the repairs.
+
+    Args:
+        learned: What the network gives when trained on draws of the proposal, unweighted.
+        proposal: One Gaussian component, from :func:`gaussian_proposal`.
+
+    Raises:
+        ValueError: If the proposal has more than one component: dividing by a mixture term by term
+            is wrong.
+    """
+    mixture, divisor = learned.mixture, proposal.mixture
+    if divisor.logits.numel() != 1:
+        raise ValueError(
+            message(
+                "a proposal of one Gaussian (a ratio of mixtures is no mixture)",
+                f"{divisor.logits.numel()} components",
+                hint='correction="importance", which is right for mixtures',
+            )
+        )
+    quotient, repaired = divide(
+        Mixture(mixture.untruncated_logits, mixture.loc, mixture.scale_tril),
+        divisor.loc[0],
+        divisor.scale_tril[0] @ divisor.scale_tril[0].mT,
+    )
+    if learned.prior.box is None:  # the prior is N(0, I) here, not a constant
+        identity = torch.eye(divisor.loc.shape[-1], dtype=divisor.loc.dtype)
+        quotient = _times_standard_normal(quotient, identity)
+    if repaired:
+        text = f"{repaired} components were wider than the proposal and had to be repaired"
+        warnings.warn(text, stacklevel=2)
+    corrected = TruncatedGaussianMixture.restrict(*quotient, learned.prior.box)
+    return PhysicsPosterior(corrected, learned.prior), repaired
+
+
+def _times_standard_normal(mixture: Mixture, identity: Tensor) -> Mixture:
+    zero = torch.zeros_like(identity[:1])
+    return multiply(mixture, Mixture(zero[:, 0], zero, identity[None]))

@@ -1,0 +1,134 @@
+"""Sequential inference: rounds of simulations, each drawn where the last posterior is.
+
+For a simulator given as a function. With an environment and a policy in the loop, see
+:mod:`torchrl_bayessim.loop`, which uses the same parts.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Correction", "SequentialRound", "sequential"]
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from ..errors import message
+from ..sources import Defensive, draw
+from .fit import FitReport, fit
+from .posterior import MixtureDensityPosterior, PhysicsPosterior
+from .priors import Prior
+from .proposals import (
+    HighestDensityPrior,
+    Proposal,
+    analytic_correction,
+    effective_sample_size,
+    gaussian_proposal,
+    importance_weights,
+)
+
+Correction = Literal["importance", "truncated", "analytic"]
+
+
+@dataclass(frozen=True)
+class SequentialRound:
+    """One round of sequential inference.
+
+    Attributes:
+        index: From 0.
+        posterior: Given the observed summaries.
+        fit: What the fit did.
+        effective_pairs: Effective number of pairs after weighting.
+        repaired: Components repaired by the analytic correction.
+    """
+
+    index: int
+    posterior: PhysicsPosterior
+    fit: FitReport
+    effective_pairs: float
+    repaired: int = 0
+
+
+def sequential(
+    simulator: Callable[[Tensor], Tensor],
+    prior: Prior,
+    observed: Tensor,
+    *,
+    rounds: int,
+    simulations: int,
+    correction: Correction = "importance",
+    defensive: float = 0.2,
+    make_posterior: Callable[[int], MixtureDensityPosterior] | None = None,
+    seed: int = 0,
+    **fit_options: Any,
+) -> Iterator[SequentialRound]:
+    """Refine a posterior round after round; a generator, so that the caller owns the loop.
+
+    Args:
+        simulator: Parameters ``(N, D)`` to summaries ``(N, L)``.
+        prior: The prior.
+        observed: Summaries of the real trajectories, ``(n, L)``.
+        rounds: Number of rounds.
+        simulations: Simulations per round.
+        correction: See :mod:`.proposals`. ``"importance"`` and ``"truncated"`` train on the pairs
+            of all rounds; ``"analytic"`` on the last round's.
+        defensive: Share of the draws from the prior that is kept in every proposal.
+        make_posterior: Summary size to a fresh network; a default one if omitted.
+        seed: Same seed, same rounds (if the simulator is deterministic).
+        **fit_options: Passed to :func:`.fit.fit`.
+
+    Yields:
+        One :class:`SequentialRound` after another.
+    """
+    if correction not in {"importance", "truncated", "analytic"}:
+        raise ValueError(
+            message("a correction", correction, available=["importance", "truncated", "analytic"])
+        )
+    proposal: Any = prior
+    history: list[tuple[Proposal, Tensor, Tensor]] = []
+    for index in range(rounds):
+        theta = draw(proposal, simulations, key=(seed, "theta", index))
+        inside = prior.contains(theta)  # a Gaussian proposal may leave a box
+        theta = theta[inside]
+        history.append((proposal, theta, simulator(theta)))
+        if correction == "analytic":
+            history = history[-1:]
+        pairs = _pairs(history, prior, weighted=correction != "analytic")
+        size = pairs["summary"].shape[-1]
+        network = (
+            MixtureDensityPosterior(prior, size, seed=seed)
+            if make_posterior is None
+            else make_posterior(size)
+        )
+        report = fit(network, pairs, seed=seed, **fit_options)
+        posterior, repaired = network.condition(observed), 0
+        if correction == "analytic" and index > 0:
+            posterior, repaired = analytic_correction(posterior, proposal)
+        effective = effective_sample_size(pairs["weight"])
+        yield SequentialRound(index, posterior, report, effective, repaired)
+        proposal = _next_proposal(posterior, prior, correction, defensive)
+
+
+def _pairs(
+    history: list[tuple[Proposal, Tensor, Tensor]], prior: Prior, *, weighted: bool
+) -> TensorDict:
+    theta = torch.cat([theta for _, theta, _ in history])
+    weight = torch.ones(len(theta))
+    if weighted:
+        proposals = [(proposal, len(theta)) for proposal, theta, _ in history]
+        weight = importance_weights(theta, prior, proposals)
+    summary = torch.cat([summary for _, _, summary in history])
+    return TensorDict({"theta": theta, "summary": summary, "weight": weight}, [len(theta)])
+
+
+def _next_proposal(
+    posterior: PhysicsPosterior, prior: Prior, correction: Correction, weight: float
+) -> Any:
+    if correction == "analytic":
+        return gaussian_proposal(posterior)
+    if correction == "truncated":
+        return Defensive(HighestDensityPrior(prior, posterior), prior, weight)
+    return Defensive(posterior, prior, weight)

@@ -1,0 +1,143 @@
+"""The real side of the loop: one method, two implementations.
+
+A *real system* answers ``rollouts(policy, episodes=, key=)`` with trajectories. A surrogate robot
+is the same simulator with parameters that nobody else knows; recorded logs are what was measured
+once, whatever the policy.
+"""
+
+from __future__ import annotations
+
+__all__ = ["RealSystem", "RecordedLogs", "SurrogateRobot"]
+
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase, TransformedEnv
+
+from .errors import message
+from .randomness import isolated, seed_from
+from .sources import Grid
+from .trajectories import first_trajectories
+from .transforms import DomainRandomizer
+
+
+class RealSystem(Protocol):
+    """What the loop asks of a robot.
+
+    Attributes:
+        recorded: Whether the answer is always the same log; the loop then replays its actions.
+    """
+
+    recorded: bool
+
+    def rollouts(
+        self, policy: TensorDictModuleBase, *, episodes: int, key: tuple[int | str, ...]
+    ) -> TensorDictBase:
+        """Return trajectories ``[episodes, T]`` with a ``"mask"``, made by ``policy``."""
+        ...
+
+
+class SurrogateRobot:
+    """A simulator with hidden parameters that stands for the robot.
+
+    Args:
+        env: With :class:`.transforms.ApplyPhysics`, and no randomizer.
+        theta: The hidden parameters, shape ``(D,)``.
+        max_steps: Steps after which an episode is cut.
+
+    Example:
+        >>> from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
+        >>> from torchrl_bayessim.physics.attributes import AttributePhysics
+        >>> from torchrl_bayessim.transforms import ApplyPhysics
+        >>> env = TransformedEnv(CartPoleEnv(4), ApplyPhysics(AttributePhysics("length")))
+        >>> robot = SurrogateRobot(env, [0.7], max_steps=20)
+        >>> real = robot.rollouts(None, episodes=6, key=(0,))
+        >>> real.batch_size, "theta" in real.keys()
+        (torch.Size([6, 20]), False)
+    """
+
+    recorded = False
+
+    def __init__(self, env: EnvBase, theta: Any, *, max_steps: int) -> None:
+        self.max_steps = max_steps
+        theta = torch.as_tensor(theta, dtype=torch.float32)
+        self._randomizer = DomainRandomizer(Grid(theta[None]))
+        self._env = TransformedEnv(env, self._randomizer, auto_unwrap=False)
+
+    @torch.no_grad()
+    def rollouts(
+        self,
+        policy: TensorDictModuleBase | None,
+        *,
+        episodes: int,
+        key: tuple[int | str, ...],
+    ) -> TensorDictBase:
+        """Return trajectories ``[episodes, T]`` with a ``"mask"``, made by ``policy``."""
+        width = max(1, self._env.batch_size.numel())
+        rows: list[TensorDictBase] = []
+        for index in range(-(-episodes // width)):
+            with isolated(*key, "robot", index):
+                self._env.set_seed(seed_from(*key, "robot", index) % 2**31)
+                batch = self._env.rollout(
+                    self.max_steps, policy, break_when_any_done=False, set_truncated=False
+                )
+            rows.append(batch if batch.ndim == 2 else batch.unsqueeze(0))
+        real = first_trajectories(torch.cat(rows)[:episodes])  # pyright: ignore[reportCallIssue, reportArgumentType]
+        return real.exclude("theta", ("next", "theta"))
+
+
+class RecordedLogs:
+    """Logs of a real robot.
+
+    Args:
+        trajectories: Batch size ``[n, T]`` with a ``"mask"``: see :func:`.trajectories.pad`.
+
+    Raises:
+        ValueError: For no trajectory, missing entries, or measurements that are not finite.
+    """
+
+    recorded = True
+
+    def __init__(self, trajectories: TensorDictBase) -> None:
+        for name in ("observation", "action", ("next", "observation"), "mask"):
+            value = trajectories.get(name, None)
+            if value is None:
+                found = sorted(map(str, trajectories.keys(include_nested=True)))
+                raise ValueError(message("logs with an entry", str(name), available=found))
+        if trajectories.ndim != 2 or not trajectories.get("mask").any(-1).all():
+            raise ValueError(
+                message(
+                    "trajectories [n, T] of at least one step each", tuple(trajectories.batch_size)
+                )
+            )
+        self._check_finite(trajectories)
+        self.trajectories = trajectories
+
+    @staticmethod
+    def _check_finite(trajectories: TensorDictBase) -> None:
+        mask: Tensor = trajectories.get("mask")
+        for name in ("observation", "action", ("next", "observation")):
+            good = trajectories.get(name).isfinite().all(-1) | ~mask
+            if not good.all():
+                row, step = (~good).nonzero()[0].tolist()
+                raise ValueError(
+                    message(
+                        f"finite values of {name!r}",
+                        f"NaN or infinity in trajectory {row} at step {step}",
+                        hint="cut the log there, or repair it",
+                    )
+                )
+
+    def rollouts(
+        self,
+        policy: TensorDictModuleBase | None,
+        *,
+        episodes: int,
+        key: tuple[int | str, ...],
+    ) -> TensorDictBase:
+        """Return all the logs, whatever the policy, the number of episodes and the key."""
+        del policy, episodes, key
+        return self.trajectories
