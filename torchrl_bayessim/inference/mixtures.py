@@ -178,11 +178,10 @@ def reduce(mixture: Mixture, components: int) -> Mixture:
         i, j = divmod(int(cost.argmin()), len(cost))
         merged = _merge(*(part[[i, j]] for part in parts))
         rest = [k for k in range(len(cost)) if k not in {i, j}]
-        parts = tuple(part[rest] for part in parts)
+        parts = tuple(torch.cat([part[rest], new]) for part, new in zip(parts, merged, strict=True))
         row = _merge_cost(merged, parts)
-        corner = torch.full_like(row[:, :1], torch.inf)
-        cost = torch.cat([torch.cat([cost[rest][:, rest], row.mT], 1), torch.cat([row, corner], 1)])
-        parts = tuple(torch.cat([part, new]) for part, new in zip(parts, merged, strict=True))
+        cost = torch.cat([torch.cat([cost[rest][:, rest], row[:, :-1].mT], 1), row])
+        cost.fill_diagonal_(torch.inf)
     weight, loc, cov = parts
     return Mixture(weight.log().log_softmax(-1), loc, torch.linalg.cholesky(cov))
 

@@ -1,0 +1,229 @@
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.distributions import MultivariateNormal
+
+from torchrl_bayessim.inference.mixtures import (
+    Mixture,
+    component_log_prob,
+    divide,
+    moment_match,
+    multiply,
+    reduce,
+)
+from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
+from torchrl_bayessim.randomness import generator
+
+SEEDS = st.integers(0, 10_000)
+LINE = torch.linspace(-12, 12, 4801, dtype=torch.float64)
+STEP = LINE[1] - LINE[0]
+
+
+def tensor(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def line_mixture(weight, mean, deviation):
+    return Mixture(tensor(*weight).log(), tensor(*mean)[:, None], tensor(*deviation)[:, None, None])
+
+
+def random_mixture(seed, *, components=3, dim=2, batch=(), widest=1.0):
+    g = generator("mixture", seed)
+    shape = (*batch, components)
+    logits = torch.randn(shape, generator=g, dtype=torch.float64)
+    loc = torch.randn(*shape, dim, generator=g, dtype=torch.float64)
+    tril = torch.randn(*shape, dim, dim, generator=g, dtype=torch.float64).tril(-1)
+    scale = 0.05 + torch.rand(*shape, dim, generator=g, dtype=torch.float64)
+    rows = tril + torch.eye(dim)
+    rows = rows / rows.norm(dim=-1, keepdim=True)
+    return Mixture(logits, loc, widest / 1.05 * scale.unsqueeze(-1) * rows)
+
+
+def log_prob(mixture, value):
+    each = component_log_prob(value, mixture.loc, mixture.scale_tril)
+    return (mixture.logits.log_softmax(-1) + each).logsumexp(-1)
+
+
+def normalised(log_density):
+    density = (log_density - log_density.max()).exp()
+    return density / (density.sum() * STEP)
+
+
+def total_variation(first, second):
+    return 0.5 * (first - second).abs().sum() * STEP
+
+
+@pytest.mark.parametrize("dim", [1, 2, 5])
+def test_component_densities_are_those_of_torch(dim):
+    mixture = random_mixture(0, dim=dim, batch=(4,))
+    value = torch.randn(7, 4, dim, generator=generator(0), dtype=torch.float64)
+    normal = MultivariateNormal(mixture.loc, scale_tril=mixture.scale_tril)
+    got = component_log_prob(value, mixture.loc, mixture.scale_tril)
+    assert got.shape == (7, 4, 3)
+    torch.testing.assert_close(got, normal.log_prob(value.unsqueeze(-2)))
+
+
+def test_draws_have_the_moments_of_the_mixture():
+    mixture = random_mixture(1)
+    draws = TruncatedGaussianMixture(*mixture, None).sample((60_000,), generator=generator(1))
+    mean, covariance = moment_match(mixture)
+    torch.testing.assert_close(draws.mean(0), mean, rtol=0, atol=0.02)
+    torch.testing.assert_close(torch.cov(draws.T), covariance, rtol=0, atol=0.03)
+
+
+def test_a_draw_comes_from_one_component_and_is_not_a_weighted_sum():
+    two = line_mixture([0.5, 0.5], [-1.0, 1.0], [0.1, 0.1])
+    draws = TruncatedGaussianMixture(*two, None).sample((20_000,), generator=generator(2))
+    assert (draws.abs() > 0.5).all()  # a weighted sum would lie near 0
+    assert draws.std().item() == pytest.approx(math.sqrt(1.01), abs=0.01)
+    assert moment_match(two)[1].item() == pytest.approx(1.01)
+
+
+def test_moments_count_the_spread_between_components():
+    mixture = random_mixture(3, dim=1)
+    density = log_prob(mixture, LINE[:, None]).exp() * STEP
+    mean = (density * LINE).sum()
+    got_mean, got_covariance = moment_match(mixture)
+    torch.testing.assert_close(got_mean.squeeze(), mean)
+    torch.testing.assert_close(got_covariance.squeeze(), (density * (LINE - mean) ** 2).sum())
+
+
+@given(seed=SEEDS, dim=st.integers(1, 3), k1=st.integers(1, 3), k2=st.integers(1, 3))
+@settings(max_examples=30, deadline=None)
+def test_a_product_is_pointwise(seed, dim, k1, k2):
+    first = random_mixture(seed, components=k1, dim=dim)
+    second = random_mixture(seed + 1, components=k2, dim=dim)
+    product = multiply(first, second)
+    assert product.logits.shape == (k1 * k2,)
+    points = torch.randn(6, dim, generator=generator(seed), dtype=torch.float64)
+    ratio = log_prob(first, points) + log_prob(second, points) - log_prob(product, points)
+    torch.testing.assert_close(ratio, ratio[:1].expand(6), rtol=1e-8, atol=1e-6)
+
+
+def test_batches_of_products_are_products_of_each():
+    first, second = random_mixture(0, batch=(4,)), random_mixture(1, components=2, batch=(4,))
+    together = multiply(first, second)
+    for i in range(4):
+        alone = multiply(Mixture(*(x[i] for x in first)), Mixture(*(x[i] for x in second)))
+        for got, expected in zip(together, alone, strict=True):
+            torch.testing.assert_close(got[i], expected)
+
+
+def test_division_by_a_gaussian_is_that_of_quadrature():
+    mixture = line_mixture([0.6, 0.3, 0.1], [-1.0, 0.5, 2.0], [0.3, 0.6, 0.9])
+    quotient, repaired = divide(mixture, tensor(0.7), tensor(1.3**2)[None])
+    divisor = line_mixture([1.0], [0.7], [1.3])
+    expected = normalised(log_prob(mixture, LINE[:, None]) - log_prob(divisor, LINE[:, None]))
+    got = log_prob(quotient, LINE[:, None]).exp()
+    torch.testing.assert_close(got, expected, rtol=1e-8, atol=1e-10)
+    assert repaired == 0
+
+
+@given(seed=SEEDS, dim=st.integers(1, 3))
+@settings(max_examples=30, deadline=None)
+def test_division_undoes_multiplication(seed, dim):
+    mixture = random_mixture(seed, dim=dim)
+    divisor = random_mixture(seed + 1, components=1, dim=dim)
+    quotient, repaired = divide(
+        multiply(mixture, divisor), divisor.loc[0], divisor.covariance[0], max_variance=1e6
+    )
+    points = torch.randn(6, dim, generator=generator(seed), dtype=torch.float64)
+    torch.testing.assert_close(
+        log_prob(quotient, points), log_prob(mixture, points), rtol=1e-4, atol=1e-4
+    )
+    assert repaired == 0
+
+
+def test_a_component_wider_than_the_divisor_is_repaired_and_counted():
+    mixture = line_mixture([0.4, 0.4, 0.2], [0.0, 1.0, 3.0], [0.2, 1.0, 2.0])
+    quotient, repaired = divide(mixture, tensor(0.0), tensor(1.0)[None])
+    assert repaired == 2  # as wide as the divisor, and wider
+    assert (quotient.covariance > 0).all()
+    torch.testing.assert_close(quotient.loc[1:, 0], tensor(1.0, 3.0))
+    torch.testing.assert_close(quotient.covariance[1:].flatten(), tensor(100.0, 100.0))
+
+
+def test_only_the_wide_directions_of_a_component_are_repaired():
+    scale = torch.diag(tensor(0.5, 2.0))[None]
+    mixture = Mixture(tensor(0.0), tensor(1.0, 1.0)[None], scale)
+    quotient, repaired = divide(mixture, tensor(0.0, 0.0), torch.eye(2, dtype=torch.float64))
+    assert repaired == 1
+    torch.testing.assert_close(quotient.covariance[0], torch.diag(tensor(1 / 3, 100.0)))
+    torch.testing.assert_close(quotient.loc[0], tensor(4 / 3, 1.0))
+
+
+@pytest.mark.parametrize("wide", [1.1, 2.0, 4.0])
+def test_a_negligible_wide_component_does_not_take_over(wide):
+    mixture = line_mixture([0.999, 0.001], [0.0, 3.0], [0.1, wide])
+    quotient, repaired = divide(mixture, tensor(0.0), tensor(1.0)[None])
+    assert repaired == 1
+    # the quotient is exact at the component's mean: 0.001 N(3; 3, wide^2) / N(3; 0, 1)
+    height = 0.001 / wide * math.exp(4.5)
+    near = 0.999 * math.sqrt(1 / (1 - 0.01))
+    share = 10 * height / (10 * height + near)
+    assert quotient.logits.softmax(-1)[1].item() == pytest.approx(share)
+
+
+def test_repairs_are_counted_over_a_batch():
+    loc = torch.zeros(3, 2, 1, dtype=torch.float64)
+    scale = tensor(0.5, 0.5, 0.5, 2.0, 2.0, 2.0).reshape(3, 2, 1, 1)
+    mixture = Mixture(torch.zeros(3, 2, dtype=torch.float64), loc, scale)
+    assert divide(mixture, tensor(0.0), tensor(1.0)[None]).repaired == 3
+
+
+def test_dividing_by_a_mixture_term_by_term_is_wrong():
+    """The reciprocal of a sum is not the sum of reciprocals: such a formula is far from the ratio.
+
+    A proposal 0.9 N(0, 0.6^2) + 0.1 N(2, 0.6^2) under a posterior N(0.2, 0.4^2).
+    """
+    mixture = line_mixture([1.0], [0.2], [0.4])
+    proposal = line_mixture([0.9, 0.1], [0.0, 2.0], [0.6, 0.6])
+    ratio = log_prob(mixture, LINE[:, None]) - log_prob(proposal, LINE[:, None])
+    exact = normalised(ratio)
+    mean = (exact * LINE).sum() * STEP
+    assert mean.item() == pytest.approx(0.311, abs=0.01)
+
+    each = divide(mixture, proposal.loc, proposal.covariance)
+    # two divisors are two problems, each with its own exact answer, never summed
+    assert each.mixture.logits.shape == (2, 1)
+    for got, loc, scale in zip(each.mixture.loc, proposal.loc, proposal.scale_tril, strict=True):
+        one = divide(mixture, loc, scale @ scale.mT)
+        torch.testing.assert_close(got, one.mixture.loc)
+
+    # sum_l (1 / gamma_l) N / N_l, whose terms have these masses
+    peak = component_log_prob(mixture.loc, each.mixture.loc, each.mixture.scale_tril).flatten()
+    at_peak = component_log_prob(mixture.loc, proposal.loc, proposal.scale_tril).flatten()
+    logits = -proposal.logits - at_peak - peak
+    termwise = Mixture(logits, each.mixture.loc[:, 0], each.mixture.scale_tril[:, 0])
+    assert total_variation(log_prob(termwise, LINE[:, None]).exp(), exact) > 0.8
+
+
+@given(seed=SEEDS, dim=st.integers(1, 3), components=st.integers(1, 12))
+@settings(max_examples=30, deadline=None)
+def test_reduction_keeps_the_moments(seed, dim, components):
+    mixture = random_mixture(seed, components=12, dim=dim)
+    reduced = reduce(mixture, components)
+    assert reduced.logits.shape == (components,)
+    for got, expected in zip(moment_match(reduced), moment_match(mixture), strict=True):
+        torch.testing.assert_close(got, expected)
+
+
+def test_reduction_merges_twins_without_loss():
+    mixture = random_mixture(0)
+    twins = Mixture(*(torch.cat([x, x]) for x in mixture))
+    points = torch.randn(20, 2, generator=generator(0), dtype=torch.float64)
+    torch.testing.assert_close(log_prob(reduce(twins, 3), points), log_prob(mixture, points))
+
+
+def test_reduction_keeps_separate_modes_apart():
+    mixture = line_mixture([0.3, 0.2, 0.4, 0.1], [-5.0, -5.1, 5.0, 5.1], [0.3, 0.3, 0.2, 0.2])
+    reduced = reduce(mixture, 2)
+    assert sorted(reduced.loc.flatten().tolist()) == pytest.approx([-5.04, 5.02])
+
+
+def test_reduction_drops_what_holds_nothing():
+    mixture = line_mixture([1.0, 1e-12], [0.0, 5.0], [1.0, 1.0])
+    assert reduce(mixture, 8).loc.tolist() == [[0.0]]
