@@ -1,3 +1,5 @@
+import io
+
 import gymnasium
 import pytest
 import torch
@@ -216,6 +218,22 @@ def test_writes_are_absolute_and_a_reset_without_theta_restores_nominal():
     torch.testing.assert_close(again.reset()["theta"], torch.tensor([0.1, 0.5]))
 
 
+def test_another_adapter_on_the_same_simulator_finds_the_nominal_values():
+    env = physical()
+    env.reset(TensorDict(theta=torch.tensor([0.7, 1.1])))
+    again = TransformedEnv(env.base_env, ApplyPhysics(AttributePhysics("length", "gravity")))
+    torch.testing.assert_close(again.reset()["theta"], torch.tensor([0.5, 9.8]))
+    assert again.unwrapped.masspole == 0.1
+
+
+def test_clones_count_their_own_episodes():
+    randomizer = DomainRandomizer(Uniform())
+    env, other = with_randomizer(randomizer), with_randomizer(randomizer.clone())
+    first = env.reset()["theta"]
+    env.reset()
+    assert torch.equal(other.reset()["theta"], first)
+
+
 def test_a_new_source_takes_effect_at_the_next_reset_also_through_clones():
     randomizer = DomainRandomizer(Uniform())
     env = with_randomizer(randomizer)
@@ -262,7 +280,10 @@ def test_state_dict_resumes_the_sequence_of_draws():
 
     env, resumed = make(seed=5), make()
     env.reset()
-    resumed.transform.load_state_dict(env.transform.state_dict())
+    file = io.BytesIO()
+    torch.save(env.state_dict(), file)
+    file.seek(0)
+    resumed.load_state_dict(torch.load(file, weights_only=True))
     assert torch.equal(env.reset()["theta"], resumed.reset()["theta"])
 
 

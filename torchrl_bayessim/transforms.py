@@ -21,7 +21,7 @@ from __future__ import annotations
 __all__ = ["ApplyPhysics", "DomainRandomizer"]
 
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -84,16 +84,22 @@ class ApplyPhysics(Transform):
                     hint="put it inside the function that makes each environment",
                 )
             )
-        # Both live on the environment: they outlast transforms and their clones, and a batched
-        # environment finds `physics_names` on its workers' environments.
-        nominal = env.__dict__.setdefault("_nominal_physics", {})
-        if any(name not in nominal for name in self.names):
+        # Noted on the environment, where it outlasts transforms and their clones, and where a
+        # batched environment finds `physics_names` on its workers' environments.
+        if self._nominal(env) is None:
+            noted = env.__dict__.setdefault("_nominal_physics", [])
             empty = TensorDict(batch_size=env.batch_size, device=env.device)
-            values = self.physics.read(env, tensordict=empty).to("cpu", torch.float64)
-            for name, value in zip(self.names, values.unbind(-1), strict=True):
-                nominal.setdefault(name, value.clone())
+            everywhere = torch.ones(env.batch_size, dtype=torch.bool)
+            for physics, nominal in noted:  # what other adapters wrote is not nominal
+                physics.write(env, nominal, mask=everywhere, tensordict=empty)
+            nominal = self.physics.read(env, tensordict=empty).to("cpu", torch.float64)
+            noted.append((self.physics, nominal.clone()))
         known = env.__dict__["physics_names"]() if "physics_names" in env.__dict__ else {}
         env.__dict__["physics_names"] = partial(dict, known | {self.key: self.names})
+
+    def _nominal(self, env: EnvBase) -> Tensor | None:
+        noted = env.__dict__.get("_nominal_physics", [])
+        return next((nominal for physics, nominal in noted if physics is self.physics), None)
 
     def transform_state_spec(self, state_spec: TensorSpec) -> TensorSpec:
         """Add θ, so that a reset can bring it."""
@@ -114,7 +120,8 @@ class ApplyPhysics(Transform):
         if tensordict is None:
             tensordict = TensorDict(batch_size=env.batch_size, device=env.device)
         shape = (*tensordict.batch_size, len(self.names))
-        nominal = torch.stack([env.__dict__["_nominal_physics"][name] for name in self.names], -1)
+        nominal = self._nominal(env)
+        assert nominal is not None  # noted when the transform was attached
         theta = tensordict.get(self.key, nominal.expand(shape)).to("cpu", torch.float64)
         mask = _resets(self.parent, tensordict)
         if theta.shape != shape:
@@ -166,7 +173,8 @@ class DomainRandomizer(Transform):
     """Draws θ at every reset, for the environments that reset and for no others.
 
     What episode ``e`` of environment ``i`` draws depends on ``(seed, i, e)`` alone: not on the
-    process that runs it nor on when it finishes.
+    process that runs it nor on when it finishes. Clones share the source and the pin, so that both
+    reach an environment that TorchRL has unwrapped; give another environment its own randomizer.
 
     Args:
         source: Where to draw from: a prior, a posterior, a `Grid`, anything that samples.
@@ -242,6 +250,12 @@ class DomainRandomizer(Transform):
     def unpin(self) -> None:
         """Draw again from the next resets on."""
         self._shared["pinned"] = None
+
+    def clone(self) -> Self:
+        """Return a copy with episodes of its own, and the same source and pin."""
+        copy = super().clone()
+        copy._episodes, copy._theta = self._episodes.clone(), self._theta.clone()
+        return copy
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Check that an `ApplyPhysics` comes before."""

@@ -3,10 +3,12 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 from tensordict import TensorDict
-from torchrl.envs import GymEnv, TransformedEnv
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import EnvBase, GymEnv, TransformedEnv
 
 from torchrl_bayessim.errors import PhysicsError
 from torchrl_bayessim.physics.attributes import AttributePhysics
+from torchrl_bayessim.physics.conformance import PhysicsTests
 from torchrl_bayessim.physics.protocol import Physics
 from torchrl_bayessim.transforms import ApplyPhysics
 
@@ -120,3 +122,37 @@ def test_is_physics_and_knows_units():
     physics = AttributePhysics("l", "foo")
     assert isinstance(physics, Physics)
     assert physics.units == ("m", "")
+
+
+class BlockEnv(EnvBase):
+    """A block on rails, written by a user: velocity' = (force - drag velocity) / mass."""
+
+    def __init__(self):
+        super().__init__()
+        self.mass, self.drag, self.on_rails = 1.0, 0.5, True
+        self.observation_spec = Composite(velocity=Unbounded(1))
+        self.action_spec, self.reward_spec = Unbounded(1), Unbounded(1)
+
+    def _reset(self, tensordict, **_):
+        return TensorDict(velocity=torch.zeros(1))
+
+    def _step(self, tensordict):
+        v = tensordict["velocity"]
+        v = v + 0.1 * (tensordict["action"] - self.drag * v) / self.mass
+        return TensorDict(velocity=v, reward=v, done=torch.zeros(1, dtype=torch.bool))
+
+    def _set_seed(self, seed):
+        pass
+
+
+class TestBlock(PhysicsTests):
+    physics = AttributePhysics("mass", "drag")
+    low, high = (0.5, 0.1), (2.0, 1.0)
+
+    def make_env(self):
+        return BlockEnv()
+
+
+def test_a_flag_is_not_a_parameter():
+    with pytest.raises(PhysicsError, match=r"attribute of BlockEnv, got 'on_rails'\. .*drag, mass"):
+        TransformedEnv(BlockEnv(), ApplyPhysics(AttributePhysics("on_rails")))
