@@ -47,11 +47,11 @@ def carrying(draws=64):
     return PolicyWithSource(policy, Around(0.2), draws=draws)
 
 
-def collector(kind, policy):
+def collector(kind, policy, **more):
     ray = isinstance(kind, partial)
     options = {} if ray else {"auto_register_policy_transforms": False}
     envs = make if kind is Collector else [make, make]
-    return kind(envs, policy, frames_per_batch=160, total_frames=3200, **options)
+    return kind(envs, policy, frames_per_batch=160, total_frames=3200, **options, **more)
 
 
 def pushed_within(collector, batches):
@@ -67,9 +67,9 @@ def pushed_within(collector, batches):
     return torch.cat(seen[:2]).unique(), seen[-1]
 
 
-def assert_push_arrives(kind):
+def assert_push_arrives(kind, **more):
     policy = carrying()
-    before, after = pushed_within(collector(kind, policy), batches=6)
+    before, after = pushed_within(collector(kind, policy, **more), batches=6)
     assert (before > 0.2).all()
     assert (before < 0.3).all()
     table = draw(Around(1.2), 64, key=(0, "round", 1, "pushed")).flatten()
@@ -84,6 +84,11 @@ def assert_push_arrives(kind):
 @pytest.mark.parametrize("kind", [Collector, MultiSyncCollector, MultiAsyncCollector])
 def test_a_pushed_source_reaches_every_worker_and_workers_draw_differently(kind):
     assert_push_arrives(kind)
+
+
+@pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are automatically unwrapped")
+def test_a_pushed_source_arrives_although_the_collector_rewraps_the_environment():
+    assert_push_arrives(Collector, max_frames_per_traj=10)
 
 
 @pytest.mark.filterwarnings("ignore")  # Ray's own

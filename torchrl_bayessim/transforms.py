@@ -22,10 +22,12 @@ __all__ = ["ApplyPhysics", "DomainRandomizer"]
 
 from functools import partial
 from typing import Any, Self
+from weakref import ref
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.collectors import BaseCollector
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform, TransformedEnv
 
@@ -221,6 +223,7 @@ class DomainRandomizer(Transform):
         self._theta = torch.zeros(0, 0)  # of the running episodes
         self._checked = False
         self._pushed: Tensor | None = None
+        self._clone_of: ref[BaseCollector] | None = None
 
     @property
     def source(self) -> Source | Grid:
@@ -255,7 +258,23 @@ class DomainRandomizer(Transform):
         """Return a copy with episodes of its own, and the same source and pin."""
         copy = super().clone()
         copy._episodes, copy._theta = self._episodes.clone(), self._theta.clone()
+        if self.collector is not None:
+            copy._clone_of = ref(self.collector)
         return copy
+
+    @property
+    def collector(self) -> BaseCollector | None:
+        """The collector that steps the environment, if there is one.
+
+        Under ``max_frames_per_traj``, collectors register themselves with the environment and then
+        replace it by one with clones of its transforms: those remember where they come from.
+        """
+        try:
+            container = self.container
+        except ValueError:  # in a Compose that has no environment yet
+            container = None
+        known = None if container is None else container.collector
+        return self._clone_of() if known is None and self._clone_of is not None else known
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Check that an `ApplyPhysics` comes before."""
