@@ -183,7 +183,7 @@ class MixtureDensityNetwork(nn.Module):
             raise ValueError(
                 message(f"summaries of shape (*, {len(self.shift)})", tuple(summary.shape))
             )
-        return ((summary - self.shift) / self.scale).asinh()
+        return ((summary - self.shift) / self.scale).asinh().to(self.shift.dtype)
 
     def forward(self, summary: Tensor) -> Mixture:
         """Return the mixture for summaries ``(*, L)``."""
@@ -298,12 +298,12 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         Raises:
             ValueError: For no summaries, wrong shapes, NaN or infinite statistics.
         """
-        summaries = torch.atleast_2d(torch.as_tensor(summaries))
-        if len(summaries) == 0 or summaries.ndim != 2:
+        given, size = torch.as_tensor(summaries), len(self.network.shift)
+        summaries = torch.atleast_2d(given)
+        if summaries.shape != (len(summaries), size) or len(summaries) == 0:
             raise ValueError(
                 message(
-                    f"summaries of n >= 1 real trajectories, shape (n, {len(self.network.shift)})",
-                    tuple(summaries.shape),
+                    f"summaries of n >= 1 real trajectories, shape (n, {size})", tuple(given.shape)
                 )
             )
         bad = ~summaries.isfinite().all(-1)

@@ -119,7 +119,8 @@ def truncated_quantile(a: Tensor, b: Tensor, u: Tensor) -> Tensor:
 @lru_cache(maxsize=32)
 def _points(dimension: int, count: int) -> Tensor:
     engine = torch.quasirandom.SobolEngine(dimension, scramble=True, seed=0)
-    return engine.draw(count, dtype=torch.float64).clamp(1e-12, 1 - 1e-12)
+    with torch.inference_mode(mode=False):  # kept for training too
+        return engine.draw(count, dtype=torch.float64).clamp(1e-12, 1 - 1e-12)
 
 
 def _chain(
@@ -294,7 +295,7 @@ class TruncatedGaussianMixture(Distribution):
             index = torch.multinomial(
                 flat.exp(), max(count, 1), replacement=True, generator=generator
             )
-            index = index.T[:count].reshape(*shape, *self.batch_shape)
+            index = index.T[:count].reshape((*shape, *self.batch_shape))
             loc = self._pick(self.loc, index, 1)
             scale = self._pick(self.scale_tril, index, 2)
             return self._metropolis(loc, scale, generator)
