@@ -35,9 +35,9 @@ def pool(each: TruncatedGaussianMixture, *, bounded: bool) -> TruncatedGaussianM
         >>> pool(each, bounded=True).scale_tril.flatten()
         tensor([0.5000], dtype=torch.float64)
     """
-    mean = (each.logits.exp().unsqueeze(-1) * each.loc).sum(-2)
-    keys = mean.tolist()
-    order = sorted(range(len(keys)), key=lambda i: (keys[i], each.logits[i].tolist()))
+    parts = (each.loc, each.logits, each.scale_tril)
+    keys = torch.cat([part.flatten(1) for part in parts], -1).tolist()
+    order = sorted(range(len(keys)), key=keys.__getitem__)
     factors = [Mixture(each.untruncated_logits[i], each.loc[i], each.scale_tril[i]) for i in order]
     product = factors[0]
     identity = torch.eye(each.loc.shape[-1], dtype=each.loc.dtype)

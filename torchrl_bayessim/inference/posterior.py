@@ -315,6 +315,8 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
                     hint="drop these trajectories, or repair their logs",
                 )
             )
+        # sums and matrix products round a row differently at another place
+        summaries = summaries[sorted(range(len(summaries)), key=summaries.tolist().__getitem__)]
         if pooling == "mean":
             return self.distribution(summaries.mean(0))
         if pooling != "product":
