@@ -91,16 +91,19 @@ def fit(
         batch_size: Pairs per step.
         lr: Initial learning rate.
         weight_decay: Of AdamW.
-        validation_fraction: Share of the pairs that is held out, at least one pair.
+        validation_fraction: Share of the pairs that is held out: at least one, all but two at most.
         patience: Stop after so many epochs without improvement.
         rescale: Whether to set the input scaling from these pairs (yes on the first fit).
         seed: Of the split and of the minibatches.
         progress: Whether to show a progress bar.
 
     Raises:
-        ValueError: For fewer than 4 usable pairs, or shapes that do not match the posterior.
+        ValueError: For fewer than 4 usable pairs, shapes that do not match the posterior,
+            parameters outside the prior, or a share that is not between 0 and 1.
         SimulationError: If no pair is finite, or the loss is not.
     """
+    if not 0 < validation_fraction < 1:
+        raise ValueError(message("a validation_fraction between 0 and 1", validation_fraction))
     pairs, dropped = usable_pairs(data.select("theta", "summary", "weight", strict=False))
     if dropped:
         warnings.warn(
@@ -108,7 +111,7 @@ def fit(
         )
     _check_pairs(posterior, pairs)
     order = torch.randperm(len(pairs), generator=generator(seed, "split"))
-    held_out = max(1, round(validation_fraction * len(pairs)))
+    held_out = min(max(1, round(validation_fraction * len(pairs))), len(pairs) - 2)
     validation, train = pairs[order[:held_out]], pairs[order[held_out:]].contiguous()
     if rescale:
         posterior.network.standardize_inputs(train.get("summary"))

@@ -1,0 +1,326 @@
+import copy
+import math
+import random
+import warnings
+
+import numpy as np
+import pytest
+import scipy.stats
+import torch
+from tensordict import TensorDict
+
+from torchrl_bayessim.errors import SimulationError
+from torchrl_bayessim.inference.fit import fit, select_lengthscale, usable_pairs
+from torchrl_bayessim.inference.losses import PosteriorLoss
+from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
+from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
+from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
+from torchrl_bayessim.randomness import generator
+
+PRIOR = BoxPrior({"mass": (2.0, 6.0), "friction": (0.01, 1.0)}, log=["friction"])
+SENSITIVITY = torch.tensor([[1.0, 0.3, 0.0], [0.6, -0.5, 1.0]])
+NOISE = 0.7
+
+
+def linear_gaussian(n, *, prior=PRIOR, key=0):
+    """x = A^T z + e in standardised coordinates, e ~ N(0, NOISE^2 I)."""
+    theta = prior.sample((n,), generator=generator("theta", key))
+    noise = torch.randn(n, 3, generator=generator("noise", key))
+    sensitivity = SENSITIVITY[: len(prior.names)]
+    summary = prior.standardize(theta) @ sensitivity + NOISE * noise
+    return TensorDict({"theta": theta, "summary": summary}, [n])
+
+
+def exact_posterior(summary, prior=PRIOR):
+    """The Gaussian posterior under a flat prior, restricted to the prior's box."""
+    sensitivity = SENSITIVITY[: len(prior.names)].double()
+    precision = sensitivity @ sensitivity.mT / NOISE**2
+    if prior.box is None:
+        precision = precision + torch.eye(len(precision))
+    covariance = torch.linalg.inv(precision)
+    mean = summary.double() @ sensitivity.mT / NOISE**2 @ covariance
+    scale = torch.linalg.cholesky(covariance).expand(*mean.shape, -1)
+    return TruncatedGaussianMixture(
+        torch.zeros(*mean.shape[:-1], 1),
+        mean.unsqueeze(-2),
+        scale.unsqueeze(-3),
+        prior.box,
+        points=2**12,
+    )
+
+
+def posterior(prior=PRIOR, **options):
+    return MixtureDensityPosterior(prior, 3, **{"components": 2} | options)
+
+
+def short_fit(net, data, **options):
+    return fit(net, data, **{"epochs": 3, "progress": False} | options)
+
+
+@pytest.fixture(scope="module", params=["box", "gaussian"])
+def fitted(request):
+    prior = PRIOR if request.param == "box" else GaussianPrior({"a": (0, 1), "b": (5, 2)})
+    net = posterior(prior)
+    data = linear_gaussian(3000, prior=prior)
+    report = fit(net, data, epochs=40, batch_size=128, lr=5e-3, progress=False)
+    return net, prior, report
+
+
+def test_a_linear_gaussian_posterior_is_recovered(fitted):
+    net, prior, _ = fitted
+    summary = linear_gaussian(100, prior=prior, key=1)["summary"]
+    exact = exact_posterior(summary, prior)
+    z = exact.sample((200,), generator=generator(0))
+    learned = net.distribution(summary).mixture
+    divergence = (exact.log_prob(z) - learned.log_prob(z)).mean(0)
+    assert divergence.mean() < 0.05
+    assert divergence.max() < 0.4
+
+
+def test_its_credible_regions_cover_as_often_as_they_say(fitted):
+    net, prior, _ = fitted
+    truths = linear_gaussian(400, prior=prior, key=2)
+    q = net.distribution(truths["summary"])
+    draws = q.sample((200,), generator=generator(1))
+    rank = (q.log_prob(draws) > q.log_prob(truths["theta"])).float().mean(0)
+    for level in (0.5, 0.8, 0.95):
+        covered = int((rank <= level).sum())
+        low, high = scipy.stats.binom(400, level).ppf([1e-4, 1 - 1e-4])
+        assert low <= covered <= high
+
+
+def test_several_trajectories_together_are_the_exact_pooled_posterior(fitted):
+    net, prior, _ = fitted
+    z = prior.standardize(prior.mean.double())
+    noise = torch.randn(4, 3, generator=generator(2))
+    real = z.float() @ SENSITIVITY + NOISE * noise
+    q = net.condition(real).mixture
+    precision = 4 * SENSITIVITY.double() @ SENSITIVITY.double().mT / NOISE**2
+    if prior.box is None:
+        precision = precision + torch.eye(2)
+    covariance = torch.linalg.inv(precision)
+    mean = real.double().sum(0) @ SENSITIVITY.double().mT / NOISE**2 @ covariance
+    exact = TruncatedGaussianMixture(
+        torch.zeros(1), mean[None], torch.linalg.cholesky(covariance)[None], prior.box
+    )
+    draws = exact.sample((2000,), generator=generator(3))
+    assert (exact.log_prob(draws) - q.log_prob(draws)).mean() < 0.4
+
+
+def test_the_report_says_what_was_done(fitted):
+    _, _, report = fitted
+    assert (report.pairs, report.dropped) == (3000, 0)
+    assert report.epochs == len(report.train) == len(report.validation) <= 40
+    assert report.best == min(report.validation) < report.validation[0]
+    assert report.train[-1] < report.train[0]
+
+
+def test_a_better_fit_has_a_lower_loss_by_as_many_nats():
+    """The held-out loss of a good fit is the entropy of the exact posterior, in original units."""
+    prior = BoxPrior({"mass": (2.0, 6.0)})
+    data = linear_gaussian(1500, prior=prior)
+    report = fit(posterior(prior), data, epochs=30, lr=5e-3, progress=False)
+    z = prior.standardize(data["theta"])
+    volume = prior.standardization.log_abs_det_jacobian(z, data["theta"])
+    entropy = (volume - exact_posterior(data["summary"], prior).log_prob(z)).mean().item()
+    assert report.best == pytest.approx(entropy, abs=0.15)
+
+
+def test_divergent_simulations_are_dropped_and_counted():
+    """In the first fit as in any other: the result is that of the finite pairs alone."""
+    data = linear_gaussian(40)
+    data["summary"][3, 1] = torch.nan
+    data["summary"][7] = torch.inf
+    data["theta"][11, 0] = torch.nan
+    net, clean = posterior(), posterior()
+    with pytest.warns(UserWarning, match="3 of 40 simulations are not finite: left out"):
+        report = short_fit(net, data)
+    assert (report.pairs, report.dropped) == (37, 3)
+    good = [row for row in range(40) if row not in {3, 7, 11}]
+    expected = short_fit(clean, data[good])
+    assert report.train == expected.train
+    assert report.validation == expected.validation
+
+
+def test_finite_pairs_give_no_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        short_fit(posterior(), linear_gaussian(20))
+
+
+def test_usable_pairs_keeps_what_else_belongs_to_a_pair():
+    data = linear_gaussian(5)
+    data["weight"] = torch.arange(5.0)
+    data["summary"][2] = torch.nan
+    pairs, dropped = usable_pairs(data)
+    assert dropped == 1
+    assert pairs["weight"].tolist() == [0, 1, 3, 4]
+
+
+def test_without_a_finite_simulation_there_is_nothing_to_fit():
+    data = linear_gaussian(20)
+    data["summary"][:] = torch.nan
+    match = "at least one simulation with finite summaries, got '20 diverged simulations of 20'"
+    with pytest.raises(SimulationError, match=match):
+        short_fit(posterior(), data)
+
+
+@pytest.mark.parametrize("options", [{"lr": 0.5, "epochs": 6}, {"epochs": 20, "patience": 2}])
+def test_the_parameters_of_the_best_epoch_are_kept(options):
+    net, data = posterior(), linear_gaussian(60)
+    report = short_fit(net, data, **{"lr": 0.05, "batch_size": 16} | options)
+    order = torch.randperm(60, generator=generator(0, "split"))
+    with torch.no_grad():
+        kept = PosteriorLoss(net)(data[order[:6]])["loss_posterior"].item()
+    assert kept == pytest.approx(report.best, abs=2e-4)
+    assert report.validation[-1] > report.best + 1e-3  # the last epoch was not the best
+
+
+def test_it_stops_once_patience_is_spent():
+    net, data = posterior(), linear_gaussian(60)
+    report = short_fit(net, data, epochs=60, patience=3, lr=0.05, batch_size=16)
+    best = report.validation.index(report.best)
+    assert report.epochs < 60
+    assert report.epochs - best - 1 == 3
+
+
+@pytest.mark.parametrize("features", ["neural", "fourier"])
+def test_the_same_seed_gives_the_same_fit(features):
+    data = linear_gaussian(40)
+    nets = [posterior(features=features) for _ in range(3)]
+    first, second, other = (
+        short_fit(net, data, seed=seed) for net, seed in zip(nets, (5, 5, 6), strict=True)
+    )
+    assert first == second
+    assert first.validation != other.validation
+    for name, value in nets[0].state_dict().items():
+        assert torch.equal(value, nets[1].state_dict()[name]), name
+
+
+def test_the_users_generators_are_untouched():
+    def states():
+        numpy = np.random.get_state()[1].tolist()  # noqa: NPY002
+        return torch.random.get_rng_state().tolist(), random.getstate(), numpy
+
+    before = states()
+    net = posterior(features="fourier")
+    short_fit(net, linear_gaussian(40))
+    select_lengthscale(net, linear_gaussian(40), factors=[1.0], epochs=1, progress=False)
+    net.condition(torch.zeros(2, 3))
+    assert states() == before
+
+
+def test_weights_choose_among_pairs():
+    """Pairs of weight zero are not learned from."""
+    prior = BoxPrior({"mass": (2.0, 6.0)})
+    theta = torch.cat([torch.full((200, 1), 2.5), torch.full((200, 1), 5.5)])
+    weight = torch.cat([torch.ones(200), torch.zeros(200)])
+    data = TensorDict({"theta": theta, "summary": torch.zeros(400, 3), "weight": weight}, [400])
+    net = posterior(prior)
+    fit(net, data, epochs=25, lr=2e-2, progress=False)
+    assert net.condition(torch.zeros(3)).mean.item() == pytest.approx(2.5, abs=0.3)
+
+
+def test_constant_statistics_are_ignored():
+    data, widened = linear_gaussian(60), linear_gaussian(60)
+    widened["summary"] = torch.cat([data["summary"], torch.full((60, 1), 1e3)], -1)
+    net = MixtureDensityPosterior(PRIOR, 4)
+    report = short_fit(net, widened)
+    assert all(math.isfinite(loss) for loss in report.validation)
+    x = torch.cat([data["summary"][:3], torch.tensor([[0.0], [1e3], [-1e9]])], -1)
+    x[:, :3] = x[0, :3]
+    log_prob = net.distribution(x).log_prob(data["theta"][0])
+    assert (log_prob == log_prob[0]).all()
+
+
+def test_statistics_that_are_all_constant_leave_the_prior():
+    data = linear_gaussian(600)
+    data["summary"].zero_()
+    net = posterior()
+    fit(net, data, epochs=20, lr=1e-2, progress=False)
+    z = PRIOR.standardize(net.condition(torch.zeros(3)).sample((4000,), generator=generator(4)))
+    assert z.mean(0).abs().max() < 0.2
+    torch.testing.assert_close(z.std(0), torch.ones(2), rtol=0, atol=0.1)
+
+
+def test_rescaling_is_left_out_on_request():
+    data, net = linear_gaussian(40), posterior()
+    data["summary"] += 100
+    short_fit(net, data, rescale=False)
+    assert (net.network.shift == 0).all()
+    short_fit(net, data)
+    assert (net.network.shift - 100).abs().max() < 1
+
+
+def test_summaries_of_double_precision_can_be_fitted():
+    data = linear_gaussian(40)
+    expected = short_fit(posterior(), data).train
+    assert short_fit(posterior(), data.double()).train == pytest.approx(expected, abs=1e-3)
+
+
+def test_select_lengthscale_finds_the_scale_of_the_data():
+    prior = BoxPrior({"mass": (2.0, 6.0)})
+    data = linear_gaussian(300, prior=prior)
+    net = posterior(prior, features="fourier")
+    before = copy.deepcopy(dict(net.named_parameters()))
+    factors = [0.02, 1.0]
+    chosen = select_lengthscale(net, data, factors=factors, epochs=10, progress=False)
+    median = torch.pdist(net.network.scaled(data["summary"])).median().item()
+    # features far narrower than the distance between summaries cannot generalise
+    assert chosen == pytest.approx(median, rel=0.05)
+    assert net.network.features.lengthscale.item() == pytest.approx(chosen)
+    for name, parameter in net.named_parameters():
+        assert torch.equal(parameter, before[name]), name
+
+
+def test_select_lengthscale_needs_fourier_features():
+    with pytest.raises(TypeError, match="a posterior over FourierFeatures, got 'NeuralFeatures'"):
+        select_lengthscale(posterior(), linear_gaussian(10))
+
+
+@pytest.mark.parametrize("value", [1.5, 6.5])
+def test_parameters_outside_the_prior_are_refused(value):
+    data = linear_gaussian(20)
+    data["theta"][4, 0] = value
+    match = rf"inside the prior BoxPrior\(mass: .*got '1 outside it, the first \[{value}"
+    with pytest.raises(ValueError, match=match):
+        short_fit(posterior(), data)
+
+
+def test_too_few_pairs_are_refused():
+    with pytest.raises(ValueError, match=r"at least 4 usable pairs, got 3\. Try: simulate more"):
+        short_fit(posterior(), linear_gaussian(3))
+
+
+@pytest.mark.parametrize("fraction", [0.0, 1.0, 1.5])
+def test_all_or_nothing_cannot_be_held_out(fraction):
+    with pytest.raises(ValueError, match="a validation_fraction between 0 and 1"):
+        short_fit(posterior(), linear_gaussian(20), validation_fraction=fraction)
+
+
+@pytest.mark.parametrize("fraction", [0.01, 0.99])
+def test_both_parts_of_the_split_hold_a_pair(fraction):
+    report = short_fit(posterior(), linear_gaussian(6), validation_fraction=fraction)
+    assert math.isfinite(report.best)
+
+
+@pytest.mark.parametrize(("dims", "size"), [(2, 4), (1, 3)])
+def test_pairs_of_other_shapes_are_refused(dims, size):
+    data = TensorDict({"theta": torch.zeros(9, dims), "summary": torch.zeros(9, size)}, [9])
+    with pytest.raises(ValueError, match=rf"the posterior, \(2, 3\), got \({dims}, {size}\)"):
+        short_fit(posterior(), data)
+
+
+def test_a_loss_that_is_not_finite_is_reported():
+    data = linear_gaussian(20)
+    data["weight"] = torch.full((20,), torch.nan)
+    with pytest.raises(SimulationError, match=r"a finite loss, got nan\. Try: a smaller learning"):
+        short_fit(posterior(), data)
+
+
+def test_one_parameter_and_one_statistic_can_be_fitted():
+    prior = BoxPrior({"mass": (2.0, 6.0)})
+    theta = prior.sample((20,), generator=generator(5))
+    data = TensorDict({"theta": theta, "summary": theta + 0.1}, [20])
+    net = MixtureDensityPosterior(prior, 1, components=1)
+    assert math.isfinite(short_fit(net, data).best)
