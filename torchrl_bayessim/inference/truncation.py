@@ -85,9 +85,11 @@ class _TruncatedQuantile(torch.autograd.Function):
         # erfc because torch.special.ndtr is 0 below -8.3
         mass_low, mass_high = (0.5 * torch.erfc(-x / math.sqrt(2)) for x in (low, high))
         body = torch.special.ndtri((mass_low + v * (mass_high - mass_low)).clamp(1e-290, 1 - 1e-16))
-        # beyond 30 deviations Phi underflows; there the density is exponential to 1 part in 900
+        # beyond 30 deviations Phi underflows; there log Phi is a parabola to 1 part in 10^4
         rate = high.clamp(max=-1.0).abs()
-        tail = high + torch.log1p((1 - v) * torch.expm1(-rate * (high - low))) / rate
+        rate = rate + 1 / rate
+        drop = -torch.log1p((1 - v) * torch.expm1(-(high - low) * (rate + (high - low) / 2)))
+        tail = high - 2 * drop / (rate + (rate.square() + 2 * drop).sqrt())
         y = torch.where(high < -30, tail, body)
         y = torch.minimum(torch.maximum(y, low), high)
         y = torch.where(flip, -y, y)
