@@ -153,8 +153,8 @@ def test_a_divergence_in_an_open_loop_leaves_nan():
     assert ahead["terminated"][0].all()
 
 
-def test_a_time_limit_truncates():
-    env = BatchedMujocoEnv(pendulum(), 2, time_limit=5)
+def test_the_last_of_max_steps_truncates():
+    env = BatchedMujocoEnv(pendulum(), 2, max_steps=5)
     rollout = env.rollout(10)
     assert rollout.shape == (2, 5)
     assert rollout["next", "truncated"][:, -1].all()
@@ -189,8 +189,12 @@ def test_bad_input_is_refused():
         env.open_loop(torch.zeros(2, 4, 1))
     with pytest.raises(RuntimeError, match="batch"):
         env.step(td[:2])
-    with pytest.raises(ValueError, match="at least one environment, got 0"):
+    with pytest.raises(ValueError, match="num_envs to be a positive integer, got 0"):
         BatchedMujocoEnv(pendulum(), 0)
+    with pytest.raises(KeyError, match=r"qvel \(did you mean this\?\)"):
+        env.place({"qvl": torch.zeros(3, 1)})
+    with pytest.raises(ValueError, match="3 rows of finite numbers for qvel"):
+        env.place({"qvel": torch.full((3, 1), torch.inf)})
     with pytest.raises(ValueError, match=r"Hopper-v5 \(did you mean this\?\)"):
         known_task("Hoper-v5")
     with pytest.raises(KeyError, match="a component of the state"):

@@ -73,7 +73,7 @@ def test_episodes_equal_the_original(name):
     rng = np.random.default_rng(0)
     low, high = env.action_spec.low.numpy(), env.action_spec.high.numpy()
     alive = np.ones(N, dtype=bool)
-    for step in range(env.time_limit):
+    for step in range(env.max_steps):
         # small actions keep bodies up for a while; single precision, as policies act
         action = (min(1.0, 0.01 * (step + 1)) * rng.uniform(low, high)).astype(np.float32)
         td["action"] = torch.from_numpy(action)
@@ -86,7 +86,7 @@ def test_episodes_equal_the_original(name):
             same(want, td, i)
             np.testing.assert_allclose(td["reward"][i].item(), reward, rtol=0, atol=TOLERANCE)
             assert td["terminated"][i].item() == terminated
-            assert td["truncated"][i].item() == (step == env.time_limit - 1)
+            assert td["truncated"][i].item() == (step == env.max_steps - 1)
             for component, array in STATE.items():
                 mine = env.stepper[component][i]
                 np.testing.assert_array_equal(mine, getattr(original.data, array).ravel())

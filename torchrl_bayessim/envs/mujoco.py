@@ -46,7 +46,7 @@ class BatchedMujocoEnv(EnvBase):
         seed: Seed of the resets. The n-th episode of environment ``i`` starts in a state that
             depends on ``(seed, i, n)`` only.
         threads: Threads that step; default all cores that this process may use.
-        time_limit: Control steps before truncation; default the task's.
+        max_steps: Control steps before truncation; default the task's.
         dtype: Of observations and rewards. Simulation is always in double precision.
 
     Attributes:
@@ -62,15 +62,20 @@ class BatchedMujocoEnv(EnvBase):
         *,
         seed: int = 0,
         threads: int | None = None,
-        time_limit: int | None = None,
+        max_steps: int | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(message("at least one environment", num_envs))
+        for name, value in {
+            "num_envs": num_envs,
+            "max_steps": max_steps,
+            "threads": threads,
+        }.items():
+            if value is not None and value < 1:
+                raise ValueError(message(f"{name} to be a positive integer", value))
         super().__init__(batch_size=torch.Size([num_envs]))
         self.task = known_task(task) if isinstance(task, str) else task
         self.num_envs = num_envs
-        self.time_limit = time_limit or self.task.time_limit
+        self.max_steps = max_steps or self.task.max_steps
         self._dtype = dtype
         self.stepper = Stepper(
             self.task.model,
@@ -242,8 +247,8 @@ class BatchedMujocoEnv(EnvBase):
         source["reward"] = reward.unsqueeze(-1).masked_fill(diverged, 0.0).to(self._dtype)
         source["diverged"] = diverged
         source["terminated"] = terminated
-        if self.time_limit is not None:
-            source["truncated"] = elapsed >= self.time_limit
+        if self.max_steps is not None:
+            source["truncated"] = elapsed >= self.max_steps
             source["done"] = terminated | source["truncated"]
         else:
             source["done"] = terminated.clone()
@@ -263,5 +268,5 @@ class BatchedMujocoEnv(EnvBase):
             low, high = (torch.as_tensor(b).float().expand(size).clone() for b in (low, high))
             self.action_spec = Bounded(low=low, high=high, shape=size, dtype=torch.float32)
         self.reward_spec = Unbounded(shape=torch.Size((*batch, 1)), dtype=self._dtype)
-        flags = ["done", "terminated"] + ["truncated"] * (self.time_limit is not None)
+        flags = ["done", "terminated"] + ["truncated"] * (self.max_steps is not None)
         self.done_spec = Composite({name: flag.clone() for name in flags}, shape=batch)

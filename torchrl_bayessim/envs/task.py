@@ -62,7 +62,7 @@ class Task:
         reset: ``draws -> {component of the state or own name: (B, size)}``; default the model's
             initial state.
         outputs: What to read, see `Stepper`.
-        time_limit: Control steps before truncation.
+        max_steps: Control steps before truncation.
         drive: How commands enter, see `Drive`.
         command: ``action (*batch, A) -> (*batch, C)``; default the action itself.
         bounds: Lowest and highest action, shape ``(A,)`` each; default those of the actuators.
@@ -76,7 +76,7 @@ class Task:
     termination: Callable[[Readings], Tensor] | None = None
     reset: Reset | None = None
     outputs: tuple[str, ...] = ("qpos", "qvel")
-    time_limit: int | None = None
+    max_steps: int | None = None
     drive: Drive = field(default_factory=Drive)
     command: Callable[[Tensor], Tensor] | None = None
     bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None

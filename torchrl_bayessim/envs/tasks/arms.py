@@ -46,7 +46,7 @@ def reacher() -> Task:
         observation=observation,
         reward=lambda _, after, action: -offset(after).norm(dim=-1) - action.square().sum(-1),
         reset=reset,
-        time_limit=50,
+        max_steps=50,
     )
 
 
@@ -85,5 +85,5 @@ def pusher() -> Task:
         observation=observation,
         reward=reward,
         reset=reset,
-        time_limit=100,
+        max_steps=100,
     )

@@ -103,7 +103,7 @@ def fetch(
         observation=observe,
         reward=reward,
         reset=reset,
-        time_limit=50,
+        max_steps=50,
     )
 
 

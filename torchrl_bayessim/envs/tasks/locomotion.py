@@ -56,7 +56,7 @@ def hopper() -> Task:
         reward=_forward_reward(dt, 1e-3, healthy),
         termination=lambda now: ~healthy(now),
         reset=uniform_reset(model, 5e-3),
-        time_limit=1000,
+        max_steps=1000,
     )
 
 
@@ -76,7 +76,7 @@ def walker2d() -> Task:
         reward=_forward_reward(dt, 1e-3, healthy),
         termination=lambda now: ~healthy(now),
         reset=uniform_reset(model, 5e-3),
-        time_limit=1000,
+        max_steps=1000,
     )
 
 
@@ -89,7 +89,7 @@ def half_cheetah() -> Task:
         observation=lambda now: torch.cat([now.qpos[..., 1:], now.qvel], -1),
         reward=_forward_reward(5 * model.opt.timestep, 0.1, 0.0),
         reset=uniform_reset(model, 0.1, velocity="normal"),
-        time_limit=1000,
+        max_steps=1000,
     )
 
 
@@ -102,7 +102,7 @@ def swimmer() -> Task:
         observation=lambda now: torch.cat([now.qpos[..., 2:], now.qvel], -1),
         reward=_forward_reward(4 * model.opt.timestep, 1e-4, 0.0),
         reset=uniform_reset(model, 0.1),
-        time_limit=1000,
+        max_steps=1000,
     )
 
 
@@ -133,7 +133,7 @@ def ant() -> Task:
         reward=reward,
         termination=lambda now: ~healthy(now),
         reset=uniform_reset(model, 0.1, velocity="normal"),
-        time_limit=1000,
+        max_steps=1000,
     )
 
 
@@ -172,5 +172,5 @@ def humanoid() -> Task:
         reward=reward,
         termination=lambda now: ~healthy(now),
         reset=uniform_reset(model, 1e-2),
-        time_limit=1000,
+        max_steps=1000,
     )

@@ -28,7 +28,7 @@ def inverted_pendulum() -> Task:
         reward=lambda before, after, action: (~fallen(after)).double(),  # noqa: ARG005
         termination=fallen,
         reset=uniform_reset(model, 0.01),
-        time_limit=1000,
+        max_steps=1000,
     )
 
 
@@ -66,5 +66,5 @@ def inverted_double_pendulum() -> Task:
         reward=reward,
         termination=fallen,
         reset=uniform_reset(model, 0.1, velocity="normal"),
-        time_limit=1000,
+        max_steps=1000,
     )

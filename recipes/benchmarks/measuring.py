@@ -1,0 +1,80 @@
+"""Throughputs measured side by side, so that what else the machine does cancels in their ratios."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping
+from importlib.metadata import version
+
+__all__ = ["compare", "options", "report"]
+
+PACKAGES = ("torch", "torchrl", "mujoco", "gymnasium", "gymnasium-robotics", "numba")
+
+
+def options(arguments: list[str], **defaults: int) -> dict[str, int]:
+    """Return ``name=value`` arguments over their defaults."""
+    given = dict(argument.split("=", 1) for argument in arguments)
+    unknown = given.keys() - defaults
+    if unknown:
+        raise SystemExit(f"expected options {sorted(defaults)}, got {sorted(unknown)}")
+    return defaults | {name: int(value) for name, value in given.items()}
+
+
+def compare(cases: Mapping[str, Callable[[], int]], *, runs: int) -> dict[str, list[float]]:
+    """Run the cases in turn, ``runs`` times after a warm-up; return frames per second of each.
+
+    A case does some work and returns how many frames it was.
+    """
+    for case in cases.values():
+        case()
+    rates: dict[str, list[float]] = {name: [] for name in cases}
+    for _ in range(runs):
+        for name, case in cases.items():
+            start = time.perf_counter()
+            frames = case()
+            rates[name].append(frames / (time.perf_counter() - start))
+    return rates
+
+
+def report(
+    benchmark: str,
+    case: str,
+    values: list[float],
+    *,
+    unit: str = "frames/s",
+    against: Mapping[str, list[float]] | None = None,
+    **context: object,
+) -> None:
+    """Print one JSON line; ``against`` gives medians of the ratios within a run."""
+    ratios = {
+        name: round(statistics.median(a / b for a, b in zip(values, other, strict=True)), 3)
+        for name, other in (against or {}).items()
+    }
+    median = statistics.median(values)
+    line = {
+        "benchmark": benchmark,
+        "case": case,
+        "value": _rounded(median),
+        "unit": unit,
+        "median": _rounded(median),
+        "min": _rounded(min(values)),
+        "max": _rounded(max(values)),
+        "runs": len(values),
+        "against": ratios,
+    }
+    print(json.dumps(line | context | dict(_provenance())), flush=True)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+def _provenance() -> Iterator[tuple[str, object]]:
+    yield "cores", len(os.sched_getaffinity(0))
+    yield "machine", platform.processor() or platform.machine()
+    yield "load", round(os.getloadavg()[0], 1)
+    yield "versions", {name: version(name) for name in PACKAGES}
