@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from .errors import message
 from .randomness import isolated, seed_from
 from .sources import Grid
-from .trajectories import first_trajectories
+from .trajectories import concatenate, first_trajectories
 from .transforms import DomainRandomizer
 
 
@@ -85,7 +85,7 @@ class SurrogateRobot:
                     self.max_steps, policy, break_when_any_done=False, set_truncated=False
                 )
             rows.append(batch if batch.ndim == 2 else batch.unsqueeze(0))
-        real = first_trajectories(torch.cat(rows)[:episodes])  # pyright: ignore[reportCallIssue, reportArgumentType]
+        real = first_trajectories(concatenate(rows)[:episodes])
         return real.exclude("theta", ("next", "theta"))
 
 

@@ -7,13 +7,13 @@ here; for recorded data, :class:`ReplayActions` repeats the recorded actions.
 
 from __future__ import annotations
 
-__all__ = ["ReplayActions", "collect_pairs", "simulate"]
+__all__ = ["ReplayActions", "collect_summaries", "simulate"]
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import BaseCollector, Collector
@@ -22,7 +22,9 @@ from tqdm.auto import tqdm
 
 from .errors import message
 from .randomness import isolated, seed_from
-from .summaries import SummaryStatistics
+from .sources import Grid, draw
+from .summaries import SummaryStatistics, pool_trajectories
+from .transforms import DomainRandomizer
 
 
 class ReplayActions(TensorDictModuleBase):
@@ -68,69 +70,83 @@ class ReplayActions(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], self.actions[rows % len(self.actions), step])
 
 
-def collect_pairs(
+def collect_summaries(
     collector: BaseCollector,
-    batches: Iterator[TensorDictBase],
-    statistics: SummaryStatistics,
+    statistics: Callable[[TensorDictBase], TensorDictBase],
+    randomizer: DomainRandomizer,
+    theta: Tensor,
     *,
-    pairs: int,
+    trajectories: int = 1,
     key: tuple[int | str, ...],
+    keep: int = 0,
     progress: bool = True,
-) -> tuple[TensorDictBase, list[TensorDictBase]]:
-    """Return at least ``pairs`` pairs, and the batches they were computed from.
+) -> tuple[Tensor, list[TensorDictBase]]:
+    """Return the pooled summaries of simulations at ``theta``, and the first ``keep`` batches.
 
-    Before every batch the environments are reset, and only each row's first trajectory counts:
-    see :func:`.trajectories.first_trajectories`.
+    Each parameter vector is given to as many environments as there are ``trajectories`` per pair,
+    whose summaries are then pooled. Before every batch all environments are reset, and only each
+    row's first trajectory counts: see :func:`.trajectories.first_trajectories`.
 
     Args:
-        collector: Whose policy made the real data; its environments draw parameters at reset.
-        batches: ``iter(collector)``.
-        statistics: Summaries.
-        pairs: Number of pairs wanted.
-        key: What the simulations are for: same key, same pairs (for a direct collector).
+        collector: Whose policy made the real data.
+        statistics: Trajectories ``[*, T]`` to ``{"summary": (*, L)}``.
+        randomizer: Of the collector's environment; it has its source back afterwards.
+        theta: Parameters to simulate, shape ``(N, D)``.
+        trajectories: Number n of trajectories per pair: as many as the robot ran.
+        key: What the simulations are for: same key, same summaries (for a direct collector).
+        keep: Number of batches to return.
         progress: Whether to show a progress bar.
+
+    Returns:
+        Summaries of shape ``(N, L)``, or ``(N, 2 L)`` for n > 1; and the batches.
     """
-    found: list[TensorDictBase] = []
+    source = randomizer.source
+    rows = theta.repeat_interleave(trajectories, 0)
+    found: list[Tensor] = []
     kept: list[TensorDictBase] = []
-    count = 0
-    with tqdm(total=pairs, desc="simulate", disable=not progress, leave=False, unit="pair") as bar:
-        while count < pairs:
-            with isolated(*key, len(kept)):
-                collector.set_seed(seed_from(*key, len(kept), "env") % 2**31)
+    done, index = 0, 0
+    bar = tqdm(total=len(theta), desc="simulate", disable=not progress, leave=False, unit="pair")
+    with bar:
+        while done < len(rows):
+            randomizer.source = Grid(rows[done:])
+            with isolated(*key, index):
+                collector.set_seed(seed_from(*key, index, "env") % 2**31)
                 collector.reset()
-                batch = next(batches).clone()
-            kept.append(batch)
-            found.append(statistics(batch).reshape(-1))
-            count += len(found[-1])
-            bar.update(len(found[-1]))
-    return torch.cat(found), kept  # pyright: ignore[reportCallIssue, reportReturnType, reportArgumentType]
+                batch: Any = collector.next()
+            if index < keep:
+                kept.append(batch.clone())
+            found.append(statistics(batch).get("summary").flatten(0, -2)[: len(rows) - done])
+            done, index = done + len(found[-1]), index + 1
+            bar.update(done // trajectories - bar.n)
+    randomizer.source = source
+    summaries = torch.cat(found).unflatten(0, (len(theta), trajectories))
+    return pool_trajectories(summaries), kept
 
 
 def simulate(
     env: EnvBase,
     policy: TensorDictModuleBase | None,
     statistics: SummaryStatistics,
+    randomizer: DomainRandomizer,
     *,
     pairs: int,
     max_steps: int,
+    trajectories: int = 1,
     seed: int = 0,
     progress: bool = True,
-    **collector_options: Any,
 ) -> TensorDictBase:
-    """Simulate pairs ``{"theta", "summary"}`` of batch size ``[N]``, N at least ``pairs``.
+    """Simulate pairs ``{"theta", "summary"}`` of batch size ``[pairs]``.
 
     Args:
-        env: With a :class:`.transforms.DomainRandomizer`, which draws the parameters.
+        env: With ``randomizer`` among its transforms.
         policy: That made the real data; ``None`` for uniformly random actions.
         statistics: Summaries.
+        randomizer: Draws the parameters: its source is where they come from.
         pairs: Number of pairs wanted.
         max_steps: Steps after which a trajectory is cut.
+        trajectories: Number of trajectories per pair, whose summaries are pooled.
         seed: Same seed, same pairs.
         progress: Whether to show a progress bar.
-        **collector_options: Passed to TorchRL's ``Collector``.
-
-    Raises:
-        ValueError: If the environment's batches have no parameters.
 
     Example:
         >>> from torchrl.envs import Compose, TransformedEnv
@@ -138,33 +154,32 @@ def simulate(
         >>> from torchrl_bayessim.inference.priors import BoxPrior
         >>> from torchrl_bayessim.physics.attributes import AttributePhysics
         >>> from torchrl_bayessim.summaries import linear_dynamics
-        >>> from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
-        >>> physics, prior = AttributePhysics("length"), BoxPrior({"length": (0.1, 2.0)})
-        >>> env = TransformedEnv(
-        ...     CartPoleEnv(64), Compose(ApplyPhysics(physics), DomainRandomizer(prior)))
-        >>> simulate(env, None, SummaryStatistics(linear_dynamics), pairs=100, max_steps=30,
-        ...          progress=False).batch_size
-        torch.Size([128])
+        >>> from torchrl_bayessim.transforms import ApplyPhysics
+        >>> randomizer = DomainRandomizer(BoxPrior({"length": (0.1, 2.0)}))
+        >>> physics = ApplyPhysics(AttributePhysics("length"))
+        >>> env = TransformedEnv(CartPoleEnv(64), Compose(physics, randomizer))
+        >>> simulate(env, None, SummaryStatistics(linear_dynamics), randomizer, pairs=100,
+        ...          max_steps=30, progress=False)["summary"].shape
+        torch.Size([100, 28])
     """
     collector = Collector(
         env,
         policy,
         frames_per_batch=max(1, env.batch_size.numel()) * max_steps,
         total_frames=-1,
-        **collector_options,
+        auto_register_policy_transforms=False,
     )
+    theta = draw(randomizer.source, pairs, key=(seed, "theta"))  # pyright: ignore[reportArgumentType]
     try:
-        found, _ = collect_pairs(
-            collector, iter(collector), statistics, pairs=pairs, key=(seed,), progress=progress
+        summaries, _ = collect_summaries(
+            collector,
+            statistics,
+            randomizer,
+            theta,
+            trajectories=trajectories,
+            key=(seed,),
+            progress=progress,
         )
     finally:
         collector.shutdown(close_env=False)
-    if "theta" not in found.keys():  # noqa: SIM118 (TensorDict iterates rows)
-        raise ValueError(
-            message(
-                "an environment that draws parameters",
-                "batches without 'theta'",
-                hint="TransformedEnv(env, Compose(ApplyPhysics(physics), DomainRandomizer(prior)))",
-            )
-        )
-    return found
+    return TensorDict({"theta": theta, "summary": summaries}, batch_size=[pairs])

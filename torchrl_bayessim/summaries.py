@@ -20,6 +20,7 @@ __all__ = [
     "encode_actions",
     "linear_dynamics",
     "moments",
+    "pool_trajectories",
     "waypoints",
 ]
 
@@ -181,6 +182,29 @@ def linear_dynamics(state: Tensor, action: Tensor, next_state: Tensor, mask: Ten
     scale = tau.square().sum(-2) / count.squeeze(-1)
     left = ((residual + 1e-12) / (scale + 1e-12)).log()
     return torch.cat([solution.mT.flatten(-2), left], -1).to(state.dtype)
+
+
+def pool_trajectories(summaries: Tensor) -> Tensor:
+    """Summarise n trajectories of one system together: mean and spread of their summaries.
+
+    A network trained on such pooled summaries gives the posterior of all n trajectories at once,
+    however they depend on each other through its own errors; a product of n single-trajectory
+    posteriors multiplies those errors too. The order of the trajectories does not matter.
+
+    Args:
+        summaries: Shape ``(*, n, L)``.
+
+    Returns:
+        Shape ``(*, 2 L)``, or ``(*, L)`` for n = 1.
+
+    Example:
+        >>> pool_trajectories(torch.tensor([[1.0], [3.0]]))
+        tensor([2.0000, 1.4142])
+    """
+    mean = summaries.mean(-2)
+    if summaries.shape[-2] == 1:
+        return mean
+    return torch.cat([mean, summaries.std(-2)], -1)
 
 
 class SummaryStatistics(TensorDictModuleBase):

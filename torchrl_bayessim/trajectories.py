@@ -7,7 +7,7 @@ Rows may differ in length; what stands behind a row's end is never read.
 
 from __future__ import annotations
 
-__all__ = ["first_trajectories", "pad", "returns"]
+__all__ = ["concatenate", "first_trajectories", "pad", "returns"]
 
 from collections.abc import Sequence
 
@@ -16,6 +16,11 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from .errors import message
+
+
+def concatenate(batches: Sequence[TensorDictBase]) -> TensorDictBase:
+    """Concatenate batches along their first dimension."""
+    return TensorDict.cat(list(batches))  # pyright: ignore[reportReturnType]
 
 
 def first_trajectories(batch: TensorDictBase) -> TensorDictBase:

@@ -212,6 +212,21 @@ class BoxPrior(Prior):
         # exp(log(high)) may exceed high by one rounding; the bound itself is in the support
         return torch.minimum(torch.maximum(theta, self.low), self.high)
 
+    def within(self, low: Tensor, high: Tensor) -> BoxPrior:
+        """Return the prior on the part of its box between ``low`` and ``high``, each ``(D,)``.
+
+        Example:
+            >>> BoxPrior({"mass": (2.0, 6.0)}).within(torch.tensor([1.0]), torch.tensor([3.0]))
+            BoxPrior(mass: [2, 3])
+        """
+        low, high = torch.maximum(low, self.low), torch.minimum(high, self.high)
+        bounds = zip(self.names, zip(low.tolist(), high.tolist(), strict=True), strict=True)
+        return BoxPrior(
+            list(bounds),
+            log=[name for name, log in zip(self.names, self.log.tolist(), strict=True) if log],
+            units=dict(zip(self.names, self.units, strict=True)),
+        )
+
     def contains(self, theta: Tensor) -> Tensor:
         """Return which parameters lie in the box (up to rounding), boolean, shape ``(*)``."""
         self._check_event(theta)

@@ -18,6 +18,7 @@ __all__ = [
     "HighestDensityPrior",
     "analytic_correction",
     "effective_sample_size",
+    "focus",
     "gaussian_proposal",
     "importance_weights",
 ]
@@ -34,7 +35,7 @@ from ..errors import SimulationError, message
 from ..sources import draw
 from .mixtures import Mixture, divide, multiply
 from .posterior import PhysicsPosterior
-from .priors import Prior
+from .priors import BoxPrior, Prior
 from .truncation import TruncatedGaussianMixture
 
 
@@ -86,6 +87,37 @@ def effective_sample_size(weights: Tensor) -> float:
         2.0
     """
     return (weights.sum().square() / weights.square().sum().clamp_min(1e-30)).item()
+
+
+def focus(
+    prior: BoxPrior, posterior: PhysicsPosterior, *, margin: float = 1.0, seed: int = 0
+) -> BoxPrior:
+    """Return the prior on the smallest box around the posterior's draws, widened.
+
+    The simplest truncated proposal: uniform, so no weights are needed, and a posterior learned on
+    the smaller box resolves it better. It is the posterior under the full prior wherever the box
+    holds all of that posterior; the margin allows for a first posterior that is too sure.
+
+    Args:
+        prior: The full prior.
+        posterior: The last round's.
+        margin: Widening on either side, as a share of the box around 4,096 draws.
+        seed: Of the draws.
+
+    Example:
+        >>> from torchrl_bayessim.inference.priors import BoxPrior
+        >>> prior = BoxPrior({"mass": (0.0, 100.0)})
+        >>> narrow = TruncatedGaussianMixture(
+        ...     torch.zeros(1), torch.zeros(1, 1), 0.01 * torch.eye(1)[None], prior.box)
+        >>> focused = focus(prior, PhysicsPosterior(narrow, prior))
+        >>> 46 < focused.low.item() < 48.5, 51.5 < focused.high.item() < 54
+        (True, True)
+    """
+    u = prior.standardize(draw(posterior, 4096, key=(seed, "focus")).double())
+    low, high = u.amin(0), u.amax(0)
+    width = (high - low).clamp_min(1e-4)
+    edges = prior.unstandardize(torch.stack([low - margin * width, high + margin * width]))
+    return prior.within(*edges.to(prior.low.dtype))
 
 
 class HighestDensityPrior:

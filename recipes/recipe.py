@@ -1,0 +1,134 @@
+"""What every recipe shares: settings from ``key=value``, a folder, provenance, one RESULT line.
+
+A recipe's settings are a dataclass; ``key=value`` arguments override its fields. The result is
+written to ``out/result.json`` and printed as the last line. Bad input ends in one message and
+exit status 2; ``debug=true`` shows the traceback instead.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from torchrl_bayessim.errors import BayesSimError, message
+
+PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "torchrl_bayessim")
+
+
+@dataclasses.dataclass
+class Settings:
+    """Fields of every recipe."""
+
+    seed: int = 0
+    out: str = ""  # folder; outputs/NAME/TIME by default
+    progress: bool = True
+    debug: bool = False
+
+
+S = TypeVar("S", bound=Settings)
+
+
+def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> None:
+    """Run ``job(settings, folder)`` with the command line's settings, and report its result."""
+    name = Path(sys.argv[0]).stem
+    start = time.monotonic()
+    debug = "debug=true" in sys.argv[1:]
+    try:
+        settings = parse(settings_type, sys.argv[1:])
+        folder = Path(
+            settings.out
+            or getattr(settings, "resume", "")
+            or f"outputs/{name}/{datetime.now():%Y-%m-%d_%H-%M-%S}"
+        )
+        folder.mkdir(parents=True, exist_ok=True)
+        result = job(settings, folder)
+    except (ValueError, TypeError, KeyError, OSError, BayesSimError) as error:
+        if debug:
+            raise
+        text = error.args[0] if isinstance(error, KeyError) and error.args else error
+        print(f"{name}: {text}", file=sys.stderr)
+        raise SystemExit(2) from None
+    result["provenance"] = provenance(settings, seconds=time.monotonic() - start)
+    text = json.dumps(plain(result))
+    write(folder / "result.json", text + "\n")
+    print(f"RESULT {text}")
+
+
+def parse(settings_type: type[S], arguments: list[str]) -> S:
+    """Return settings from ``key=value`` arguments.
+
+    Raises:
+        ValueError: For an unknown key, a value of the wrong type, or an argument without ``=``.
+    """
+    fields = [field.name for field in dataclasses.fields(settings_type)]
+    for argument in arguments:
+        key, equals, _ = argument.partition("=")
+        if not equals:
+            raise ValueError(message("arguments of the form key=value", argument))
+        if key not in fields:
+            raise ValueError(message("the name of a setting", key, available=fields))
+    try:
+        merged = OmegaConf.merge(OmegaConf.structured(settings_type), OmegaConf.from_cli(arguments))
+        return OmegaConf.to_object(merged)  # pyright: ignore[reportReturnType]
+    except OmegaConfBaseException as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(message("values of the settings' types", reason)) from None
+
+
+def provenance(settings: Settings, *, seconds: float) -> dict[str, Any]:
+    """Return what is needed to run this again and to judge its timing."""
+    root = Path(__file__).parent
+    git = subprocess.run(
+        ["git", "describe", "--always", "--dirty"],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return {
+        "commit": git.stdout.strip() or None,
+        "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
+        "python": platform.python_version(),
+        "seed": settings.seed,
+        "command": "python " + " ".join(sys.argv),
+        "machine": {
+            "system": platform.platform(),
+            "cores": os.cpu_count(),
+            "threads": torch.get_num_threads(),
+        },
+        "seconds": round(seconds, 2),
+    }
+
+
+def write(path: Path, text: str) -> None:
+    """Write a file wholly or not at all."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_text(text)
+    temporary.replace(path)
+
+
+def plain(value: Any) -> Any:
+    """Return what JSON can hold."""
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, torch.Tensor):
+        return plain(value.tolist())
+    if isinstance(value, float):  # JSON has neither NaN nor infinity
+        return value if abs(value) < float("inf") else None
+    return str(value) if isinstance(value, Path) else value

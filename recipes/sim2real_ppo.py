@@ -1,0 +1,293 @@
+"""From a prior over physics to a policy trained where the real robot plausibly is.
+
+    python recipes/sim2real_ppo.py task=cartpole
+
+A surrogate robot has parameters that only the final score may see. Three rounds: the robot runs
+the policy; a posterior over its parameters is inferred from those episodes; PPO goes on under that
+posterior. The same PPO under the prior, with as many frames, is the baseline. Writes result.json,
+pictures, learning curves and a checkpoint; ``resume=FOLDER`` goes on after a break.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import recipe
+import torch
+from tasks import TASKS, Task
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.record.loggers import get_logger
+from tqdm.auto import tqdm
+
+from torchrl_bayessim import plots
+from torchrl_bayessim.agents.ppo import PPO
+from torchrl_bayessim.errors import message
+from torchrl_bayessim.evaluation import evaluate
+from torchrl_bayessim.inference.refinement import PosteriorRefinement
+from torchrl_bayessim.loop import Round, SimToRealLoop, ended_return
+from torchrl_bayessim.randomness import isolated
+from torchrl_bayessim.robots import SurrogateRobot
+from torchrl_bayessim.sources import Grid, draw
+from torchrl_bayessim.summaries import SummaryStatistics
+from torchrl_bayessim.transforms import DomainRandomizer
+
+
+@dataclass
+class Sim2Real(recipe.Settings):
+    """Settings; ``key=value`` on the command line overrides them."""
+
+    task: str = "cartpole"
+    truth: str = "nominal"  # or "random": drawn from the prior by the seed
+    rounds: int = 3
+    episodes: int = 8  # real episodes per round
+    simulations: int = 1024  # pairs per round
+    updates: int = 0  # PPO updates per round; 0 for the task's own number
+    baseline: bool = True  # also train under the prior, with as many frames
+    short: bool = False  # a smoke test: everything runs, little is learned
+    logger: str = "csv"  # or tensorboard, wandb, mlflow
+    resume: str = ""  # folder of a run that was broken off
+
+
+def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
+    """Run the loop and its baseline, score both at the robot, and draw the pictures."""
+    if settings.task not in TASKS:
+        raise ValueError(message("a task", settings.task, available=TASKS))
+    torch.set_num_threads(1)  # batches are small: a second thread only costs
+    task = TASKS[settings.task]
+    if settings.short:
+        settings.episodes, settings.simulations, settings.updates = 4, 192, 2
+    truth = true_parameters(task, settings)
+    score = Score(task, truth, episodes=16 if settings.short else 100)
+    logger = get_logger(settings.logger, logger_name=str(out), experiment_name="log")
+
+    loop, learner = make_loop(task, truth, settings, out)
+    done = Journal(out / "rounds.json", resume=loop.resume() if settings.resume else False)
+    print(f"{settings.task}: {task.prior}")
+    for turn in loop:
+        returns = score(learner.policy)
+        done.add(turn.index, describe(turn, task, truth, returns))
+        for entry in turn.curve:
+            for name, value in entry.items():
+                logger.log_scalar(f"train/{name}", value, step=int(entry["frames"]))
+        print(sentence(turn, task, done.rounds[-1]))
+
+    mean, interval = confidence(returns)
+    result: dict[str, Any] = {
+        "task": settings.task,
+        "parameters": list(task.prior.names),
+        "true": truth.tolist(),
+        "rounds": [{k: v for k, v in entry.items() if k != "curve"} for entry in done.rounds],
+        "checkpoint": out / "checkpoint.pt",
+    }
+    curves = {"posterior": [point for entry in done.rounds for point in entry["curve"]]}
+    if settings.baseline:
+        policy, curves["prior"] = train_under_prior(task, settings, frames=turn.frames)
+        baseline = score(policy)
+        mean, interval = confidence(baseline)
+        gain, gain_interval = confidence(returns - baseline)
+        result["baseline"] = {"source": "prior", "real_return": mean, "real_return_ci": interval}
+        result["gain"] = {"real_return": gain, "real_return_ci": gain_interval}
+        print(f"prior only: the robot earns {mean:.1f} {shown(interval)} after as many frames")
+    draw_pictures(out, task, turn, result=result, curves=curves)
+    print(f"Pictures and numbers are in {out}")
+    return result
+
+
+def true_parameters(task: Task, settings: Sim2Real) -> Tensor:
+    """Return what the surrogate robot hides, in the prior's order."""
+    if settings.truth == "random":
+        return draw(task.prior, 1, key=(settings.seed, "truth"))[0]
+    if settings.truth != "nominal":
+        raise ValueError(message("a truth", settings.truth, available=["nominal", "random"]))
+    return torch.tensor([task.truth[name] for name in task.prior.names])
+
+
+def make_loop(
+    task: Task, truth: Tensor, settings: Sim2Real, out: Path
+) -> tuple[SimToRealLoop, PPO]:
+    """Return the loop and its learner."""
+    randomizer = DomainRandomizer(task.prior, seed=settings.seed)
+    env = task.make(task.environments, seed=settings.seed, randomizer=randomizer)
+    robot_env = task.make(settings.episodes, seed=settings.seed, randomizer=None)
+    learner = PPO(env, seed=settings.seed, **task.ppo)
+    loop = SimToRealLoop(
+        env,
+        learner,
+        SurrogateRobot(robot_env, truth, max_steps=task.horizon),
+        refinement=PosteriorRefinement(
+            task.prior,
+            simulations=settings.simulations,
+            seed=settings.seed,
+            fit_options={"progress": settings.progress},
+        ),
+        statistics=SummaryStatistics(*task.summaries),
+        randomizer=randomizer,
+        horizon=task.horizon,
+        episodes=settings.episodes,
+        updates=settings.updates or task.updates,
+        rounds=settings.rounds,
+        seed=settings.seed,
+        checkpoint_file=out / "checkpoint.pt",
+        progress=settings.progress,
+    )
+    return loop, learner
+
+
+class Score:
+    """Returns at the robot; the only code that may see its parameters.
+
+    The same initial states every time, so that two policies are compared in pairs.
+    """
+
+    def __init__(self, task: Task, truth: Tensor, *, episodes: int) -> None:
+        self.max_steps = task.max_steps
+        self.env = task.make(episodes, seed=0, randomizer=DomainRandomizer(Grid(truth[None])))
+
+    def __call__(self, policy: Any) -> Tensor:
+        """Return the return of every episode, shape ``(episodes,)``."""
+        self.env.set_seed(1_000_003)
+        with isolated("score"):
+            return evaluate(self.env, policy, max_steps=self.max_steps)
+
+
+class Journal:
+    """What each round gave, kept beside the checkpoint so that a resumed run reports them all."""
+
+    def __init__(self, path: Path, *, resume: bool) -> None:
+        self.path = path
+        self.rounds: list[dict[str, Any]] = json.loads(path.read_text()) if resume else []
+
+    def add(self, index: int, entry: dict[str, Any]) -> None:
+        """Keep the entry of round ``index``, which may be told twice after a break."""
+        self.rounds = [*self.rounds[:index], entry]
+        recipe.write(self.path, json.dumps(recipe.plain(self.rounds)))
+
+
+def train_under_prior(
+    task: Task, settings: Sim2Real, *, frames: int
+) -> tuple[Any, list[dict[str, float]]]:
+    """Return a policy that the same PPO learned under the prior, and its learning curve."""
+    env = task.make(task.environments, seed=settings.seed, randomizer=DomainRandomizer(task.prior))
+    learner = PPO(env, seed=settings.seed, **task.ppo)
+    batch_frames = task.environments * task.horizon
+    collector = Collector(
+        env,
+        learner.policy,
+        frames_per_batch=batch_frames,
+        total_frames=frames,
+        auto_register_policy_transforms=False,
+    )
+    batches, curve = iter(collector), []
+    updates = math.ceil(frames / batch_frames)
+    bar = tqdm(range(updates), desc="prior only", leave=False, disable=not settings.progress)
+    for update in bar:
+        with isolated(settings.seed, "prior", update):
+            batch = next(batches)
+        reported = learner.update(batch, key=("prior", update), progress=update / updates)
+        frames_so_far = (update + 1.0) * batch_frames
+        curve.append({"frames": frames_so_far, "return": ended_return(batch), **reported})
+    collector.shutdown()
+    return learner.policy, curve
+
+
+def describe(turn: Round, task: Task, truth: Tensor, returns: Tensor) -> dict[str, Any]:
+    """Return the round's entry of result.json."""
+    posterior = turn.posterior
+    log_prob = posterior.log_prob(truth).item()
+    mean, interval = confidence(returns)
+    trained = [point["return"] for point in turn.curve if math.isfinite(point["return"])]
+    return {
+        "round": turn.index + 1,
+        "posterior_mean": posterior.mean.tolist(),
+        "posterior_sd": posterior.stddev.tolist(),
+        "log_prob_true": log_prob,
+        "nats_over_prior": log_prob - task.prior.log_prob(truth).item(),
+        "real_return": mean,
+        "real_return_ci": interval,
+        "sim_return": trained[-1] if trained else None,
+        "frames": turn.frames,
+        "simulations": turn.simulations,
+        "seconds": turn.seconds,
+        "curve": turn.curve,
+    }
+
+
+def confidence(values: Tensor) -> tuple[float, list[float]]:
+    """Return mean and 95 % interval of the mean."""
+    mean = values.mean().item()
+    half = 1.96 * values.std().item() / math.sqrt(len(values))
+    return mean, [mean - half, mean + half]
+
+
+def shown(interval: list[float]) -> str:
+    """Return an interval as text."""
+    return f"[{interval[0]:.1f}, {interval[1]:.1f}]"
+
+
+def sentence(turn: Round, task: Task, entry: dict[str, Any]) -> str:
+    """Return the round in one line."""
+    rows = zip(
+        task.prior.names,
+        entry["posterior_mean"],
+        entry["posterior_sd"],
+        task.prior.units,
+        strict=True,
+    )
+    physics = ", ".join(f"{n} {m:.3g} ± {s:.2g} {u}".rstrip() for n, m, s, u in rows)
+    return (
+        f"round {turn.index + 1}: {physics} ({entry['nats_over_prior']:+.1f} nats over the prior); "
+        f"the robot earns {entry['real_return']:.1f} {shown(entry['real_return_ci'])} "
+        f"after {turn.frames:,} frames, {turn.seconds:.0f} s"
+    )
+
+
+def draw_pictures(
+    out: Path,
+    task: Task,
+    turn: Round,
+    *,
+    result: dict[str, Any],
+    curves: dict[str, list[dict[str, float]]],
+) -> None:
+    """Write posterior.png, learning.png and return.png."""
+    figure = plots.pair_plot(
+        draw(turn.posterior, 4000, key=("picture",)),
+        names=task.prior.names,
+        units=task.prior.units,
+        prior_samples=draw(task.prior, 4000, key=("picture", "prior")),
+        truth=torch.tensor(result["true"]),
+    )
+    figure.savefig(out / "posterior.png", dpi=150)
+    lines = {
+        f"trained under the {name}": (
+            torch.tensor([point["frames"] for point in curve if ended(point)]),
+            torch.tensor([point["return"] for point in curve if ended(point)]),
+        )
+        for name, curve in curves.items()
+        if any(ended(point) for point in curve)
+    }
+    if lines:
+        figure = plots.learning_curves(lines, ylabel="return of finished episodes in simulation")
+        figure.savefig(out / "learning.png", dpi=150)
+    baseline = result.get("baseline", {})
+    figure = plots.return_per_round(
+        [entry["real_return"] for entry in result["rounds"]],
+        [tuple(entry["real_return_ci"]) for entry in result["rounds"]],
+        baseline=baseline.get("real_return"),
+        baseline_interval=tuple(baseline["real_return_ci"]) if baseline else None,
+    )
+    figure.savefig(out / "return.png", dpi=150)
+
+
+def ended(point: dict[str, float]) -> bool:
+    """Return whether an episode ended in this point's batch."""
+    return point["return"] is not None and math.isfinite(point["return"])
+
+
+if __name__ == "__main__":
+    recipe.main(Sim2Real, job)

@@ -1,0 +1,125 @@
+"""The tasks of the recipes: simulator, prior, hidden truth, and PPO's settings.
+
+Priors and true values of the classic-control tasks are those of the BayesSim paper's Table 1
+(arXiv:1906.01728); where it gives no true value, Gymnasium's default is the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEnv
+
+from torchrl_bayessim.envs.classic_control.acrobot import AcrobotEnv
+from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
+from torchrl_bayessim.envs.classic_control.mountain_car import MountainCarContinuousEnv
+from torchrl_bayessim.envs.classic_control.pendulum import PendulumEnv
+from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.physics.attributes import AttributePhysics
+from torchrl_bayessim.physics.mujoco import MujocoPhysics
+from torchrl_bayessim.physics.protocol import Physics
+from torchrl_bayessim.summaries import Summary, duration, linear_dynamics
+from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
+
+
+@dataclass(frozen=True)
+class Task:
+    """One problem.
+
+    Attributes:
+        simulator: Number of environments and seed to a batched environment.
+        prior: What is believed before any data.
+        truth: The surrogate robot's parameters.
+        physics: Where the parameters go.
+        max_steps: Length of an episode.
+        environments: Environments that train.
+        horizon: Steps per batch and per summarised trajectory.
+        updates: Learner updates per round.
+        ppo: PPO's settings.
+        summaries: Statistics of trajectories.
+    """
+
+    simulator: Callable[[int, int], EnvBase]
+    prior: BoxPrior
+    truth: Mapping[str, float]
+    physics: Callable[[], Physics]
+    max_steps: int
+    environments: int = 256
+    horizon: int = 128
+    updates: int = 4
+    ppo: Mapping[str, Any] = field(default_factory=dict)
+    summaries: Sequence[Summary] = (linear_dynamics, duration)
+
+    def make(self, environments: int, *, seed: int, randomizer: DomainRandomizer | None) -> EnvBase:
+        """Return the simulator with the physics, and with the randomizer if one is given."""
+        transforms = [ApplyPhysics(self.physics())]
+        if randomizer is not None:
+            transforms.append(randomizer)
+        return TransformedEnv(
+            self.simulator(environments, seed),
+            Compose(*transforms, StepCounter(self.max_steps), RewardSum()),
+        )
+
+
+TASKS: dict[str, Task] = {
+    "cartpole": Task(
+        simulator=lambda n, seed: CartPoleEnv(n, seed=seed),
+        prior=BoxPrior(
+            {"length": (0.1, 2.0), "masspole": (0.1, 2.0)}, units={"length": "m", "masspole": "kg"}
+        ),
+        truth={"length": 0.5, "masspole": 0.1},
+        physics=lambda: AttributePhysics("length", "masspole"),
+        max_steps=500,
+    ),
+    "pendulum": Task(
+        simulator=lambda n, seed: PendulumEnv(n, seed=seed),
+        prior=BoxPrior({"dt": (0.01, 0.3)}, units={"dt": "s"}),
+        truth={"dt": 0.05},
+        physics=lambda: AttributePhysics("dt"),
+        max_steps=200,
+    ),
+    "mountain_car": Task(
+        simulator=lambda n, seed: MountainCarContinuousEnv(n, seed=seed),
+        prior=BoxPrior({"power": (0.0005, 0.1)}, log=["power"]),
+        truth={"power": 0.0015},
+        physics=lambda: AttributePhysics("power"),
+        max_steps=999,
+    ),
+    "acrobot": Task(
+        simulator=lambda n, seed: AcrobotEnv(n, seed=seed),
+        prior=BoxPrior(
+            {
+                "LINK_MASS_1": (0.5, 2.0),
+                "LINK_MASS_2": (0.5, 2.0),
+                "LINK_LENGTH_1": (0.1, 1.5),
+                "LINK_LENGTH_2": (0.5, 1.5),
+            },
+            units={
+                "LINK_MASS_1": "kg",
+                "LINK_MASS_2": "kg",
+                "LINK_LENGTH_1": "m",
+                "LINK_LENGTH_2": "m",
+            },
+        ),
+        truth=dict.fromkeys(("LINK_MASS_1", "LINK_MASS_2", "LINK_LENGTH_1", "LINK_LENGTH_2"), 1.0),
+        physics=lambda: AttributePhysics(
+            "LINK_MASS_1", "LINK_MASS_2", "LINK_LENGTH_1", "LINK_LENGTH_2"
+        ),
+        max_steps=500,
+    ),
+    "hopper": Task(
+        simulator=lambda n, seed: BatchedMujocoEnv("Hopper-v5", n, seed=seed),
+        prior=BoxPrior(
+            {"torso_mass": (2.0, 6.0), "friction": (0.4, 2.0)}, units={"torso_mass": "kg"}
+        ),
+        truth={"torso_mass": 3.67, "friction": 1.2},
+        physics=lambda: MujocoPhysics(
+            torso_mass="body_mass[torso]",
+            friction=("geom_friction[floor,0]", "geom_friction[foot_geom,0]"),
+        ),
+        max_steps=1000,
+    ),
+}

@@ -1,0 +1,428 @@
+"""The loop: real data, posterior, policy trained under it, new real data.
+
+Each round (BayesSim, arXiv:1906.01728, fig. 1, made iterative):
+
+1. the robot runs the current policy;
+2. the collector simulates with the *same* policy, parameters drawn where the last posterior is;
+   its batches give pairs for the posterior **and** are kept for the learner;
+3. the posterior is refined, conditioned on all the real data so far;
+4. the randomizer draws from it, and the learner improves the policy from the batches of step 2
+   and from new ones.
+
+Summaries depend on the policy. So each parameter vector is simulated under every policy that made
+real data, as many trajectories each as the robot ran, and the network sees the pooled summaries
+side by side. Recorded logs are simulated by replaying their actions.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Learner", "Round", "SimToRealLoop"]
+
+import copy
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+from tqdm.auto import tqdm
+
+from . import checkpoint
+from .errors import message
+from .inference.fit import FitReport
+from .inference.posterior import PhysicsPosterior
+from .inference.refinement import PosteriorRefinement
+from .randomness import isolated, seed_from
+from .robots import RealSystem
+from .simulate import ReplayActions, collect_summaries
+from .sources import Defensive
+from .summaries import SummaryStatistics, pool_trajectories
+from .trajectories import concatenate, first_trajectories
+from .transforms import DomainRandomizer
+
+
+class Learner(Protocol):
+    """What the loop asks of an agent: a policy, and a way to improve it from batches."""
+
+    policy: TensorDictModuleBase
+
+    def update(
+        self, batch: TensorDictBase, *, key: tuple[int | str, ...], progress: float
+    ) -> dict[str, float]:
+        """Improve the policy from a batch ``[N, T]``; ``progress`` in [0, 1] is the share done."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that ``update`` depends on."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from such a state."""
+        ...
+
+
+@dataclass(frozen=True)
+class Round:
+    """One turn of the loop.
+
+    Attributes:
+        index: From 0.
+        posterior: Given all the real trajectories of this and earlier rounds.
+        real: This round's real trajectories, ``[n, T]``.
+        fit: What the fit of the posterior did.
+        simulations: Pairs that the fit used.
+        frames: Environment frames that the learner has seen since the start.
+        curve: One entry per update: ``frames``, ``return`` of the episodes that ended in the
+            batch (NaN if none did), and what the learner reports.
+        seconds: Wall time of the round.
+    """
+
+    index: int
+    posterior: PhysicsPosterior
+    real: TensorDictBase
+    fit: FitReport
+    simulations: int
+    frames: int
+    curve: list[dict[str, float]]
+    seconds: float
+
+
+class SimToRealLoop:
+    """Rounds of inference and learning; iterate over it, and stop when you like.
+
+    Args:
+        env: Simulated environments, batch size ``[N]``, with ``randomizer`` among their
+            transforms. With recorded logs it needs a ``StepCounter``.
+        learner: Such as :class:`.agents.ppo.PPO`; its policy collects and is improved.
+        robot: The real side.
+        refinement: The posterior, and how it is refined.
+        statistics: Summaries of trajectories.
+        randomizer: The transform of ``env`` that draws the parameters.
+        horizon: Steps per row of a batch, and of the trajectories that are summarised.
+        episodes: Real episodes per round.
+        updates: Learner updates per round from batches drawn under the new posterior.
+        shared_batches: How many of the batches simulated for inference also feed the learner.
+        defensive: Probability of a prior draw while training, so that an overconfident posterior
+            cannot starve it.
+        rounds: Rounds planned.
+        seed: Same seed, same rounds.
+        checkpoint_file: Written after every step of the loop; :meth:`resume` goes on from it.
+        checkpoint_every: Updates between two checkpoints. Episodes begin anew after each.
+        progress: Whether to show progress bars.
+
+    Example::
+
+        loop = SimToRealLoop(env, ppo, robot, refinement=PosteriorRefinement(prior),
+                             statistics=statistics, randomizer=randomizer, rounds=3)
+        for turn in loop:
+            print(turn.index, turn.posterior.mean, turn.posterior.stddev)
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        learner: Learner,
+        robot: RealSystem,
+        *,
+        refinement: PosteriorRefinement,
+        statistics: SummaryStatistics,
+        randomizer: DomainRandomizer,
+        horizon: int = 128,
+        episodes: int = 8,
+        updates: int = 16,
+        shared_batches: int = 4,
+        defensive: float = 0.1,
+        rounds: int = 3,
+        seed: int = 0,
+        checkpoint_file: str | Path | None = None,
+        checkpoint_every: int = 8,
+        progress: bool = True,
+    ) -> None:
+        self.settings: dict[str, Any] = {
+            "horizon": horizon,
+            "episodes": episodes,
+            "rounds": rounds,
+            "checkpoint_every": checkpoint_every,
+            "environments": max(1, env.batch_size.numel()),
+        }
+        for name, value in self.settings.items():
+            if value < 1:
+                raise ValueError(message(f"{name} to be positive", value))
+        self.settings |= {
+            "updates": updates,
+            "shared_batches": shared_batches,
+            "simulations": refinement.simulations,
+            "names": list(refinement.prior.names),
+            "seed": seed,
+        }
+        self.env, self.learner, self.robot = env, learner, robot
+        self.refinement, self.statistics, self.randomizer = refinement, statistics, randomizer
+        self.horizon, self.episodes, self.rounds = horizon, episodes, rounds
+        self.updates, self.shared_batches = updates, shared_batches
+        self.defensive, self.seed, self.progress = defensive, seed, progress
+        self.checkpoint_file = None if checkpoint_file is None else Path(checkpoint_file)
+        self.checkpoint_every = checkpoint_every
+        self._state: dict[str, Any] = {"round": 0, "frames": 0, "evidence": []} | _FRESH
+        self._collector: Collector | None = None
+
+    def __iter__(self) -> Iterator[Round]:
+        """Yield the rounds that are left."""
+        try:
+            while self._state["round"] < self.rounds:
+                yield self._turn()
+                # only now: a run that is killed while the caller works yields the round again
+                self._state |= {"round": self._state["round"] + 1} | _FRESH
+                self._keep()
+        finally:
+            if self._collector is not None:
+                self._collector.shutdown(close_env=False)
+                self._collector = None
+
+    # One round, in steps after each of which the state is kept.
+
+    def _turn(self) -> Round:
+        state = self._state
+        if state["update"] < 0:
+            self._step(self._infer)
+        posterior = self.refinement.posterior
+        assert posterior is not None  # _infer has refined it
+        self.randomizer.source = Defensive(posterior, self.refinement.prior, self.defensive)
+        while state["update"] < self.updates:
+            self._step(self._train)
+        return Round(
+            index=state["round"],
+            posterior=posterior,
+            real=_unflatten(state["real"]),
+            fit=FitReport(**state["fit"]),
+            simulations=state["fit"]["pairs"],
+            frames=state["frames"],
+            curve=list(state["curve"]),
+            seconds=state["seconds"],
+        )
+
+    def _step(self, work: Callable[[], None]) -> None:
+        start = time.monotonic()
+        work()
+        self._state["seconds"] += time.monotonic() - start
+        self._keep()
+
+    def _infer(self) -> None:
+        state, key = self._state, (self.seed, "round", self._state["round"])
+        real = self.robot.rollouts(self.learner.policy, episodes=self.episodes, key=key)
+        evidence: list[dict[str, Any]] = [] if self.robot.recorded else list(state["evidence"])
+        evidence.append(
+            {
+                "policy": dict(copy.deepcopy(self.learner.policy).state_dict()),
+                "summary": pool_trajectories(self.statistics(real).get("summary")),
+            }
+        )
+        shared: list[TensorDictBase] = []
+
+        def simulate(theta: Tensor) -> Tensor:
+            parts = []
+            for index, entry in enumerate(evidence):
+                where = (*key, "evidence", index)
+                if self.robot.recorded:
+                    parts.append(self._replay(real, theta, where))
+                elif index < len(evidence) - 1:
+                    parts.append(self._repeat(entry["policy"], theta, where))
+                else:
+                    part, batches = self._simulate(theta, where)
+                    parts.append(part)
+                    shared.extend(batches)
+            return torch.cat(parts, -1)
+
+        observed = torch.cat([entry["summary"] for entry in evidence], -1)
+        report = self.refinement.refine(simulate, observed, key=key)
+        state |= {
+            "evidence": evidence,
+            "real": _flatten(real),
+            "fit": dataclasses.asdict(report),
+            "update": 0,
+        }
+        if shared:  # collected with this very policy: the learner's first update of the round
+            self._update(concatenate(shared))
+
+    def _train(self) -> None:
+        state = self._state
+        first = state["update"]
+        last = min(first + self.checkpoint_every, self.updates)
+        key = (self.seed, "round", state["round"], "train", first)
+        collector = self._collect()
+        with isolated(*key, "reset"):
+            collector.set_seed(seed_from(*key, "env") % 2**31)
+            collector.reset()
+        label = f"round {state['round'] + 1} of {self.rounds}: train"
+        for update in tqdm(range(first, last), desc=label, disable=not self.progress, leave=False):
+            with isolated(*key, update):
+                batch = self._collect().next()
+            self._update(batch)
+        state["update"] = last
+
+    def _update(self, batch: TensorDictBase) -> None:
+        state = self._state
+        planned = self.rounds * (self.updates + 1)
+        done = state["round"] * (self.updates + 1) + len(state["curve"])
+        key = (self.seed, "round", state["round"], "update", len(state["curve"]))
+        reported = self.learner.update(batch, key=key, progress=done / planned)
+        state["frames"] += batch.numel()
+        entry = {"frames": float(state["frames"]), "return": ended_return(batch), **reported}
+        state["curve"] = [*state["curve"], entry]
+
+    # Simulation: under the present policy, under an earlier one, or replaying logs.
+
+    def _collect(self) -> Collector:
+        if self._collector is None:
+            self._collector = self._make_collector(self.learner.policy, self.horizon)
+        return self._collector
+
+    def _make_collector(self, policy: TensorDictModuleBase, steps: int) -> Collector:
+        return Collector(
+            self.env,
+            policy,
+            frames_per_batch=self.settings["environments"] * steps,
+            total_frames=-1,
+            auto_register_policy_transforms=False,
+        )
+
+    def _simulate(
+        self, theta: Tensor, key: tuple[int | str, ...]
+    ) -> tuple[Tensor, list[TensorDictBase]]:
+        return collect_summaries(
+            self._collect(),
+            self.statistics,
+            self.randomizer,
+            theta,
+            trajectories=self.episodes,
+            key=key,
+            keep=self.shared_batches,
+            progress=self.progress,
+        )
+
+    def _repeat(
+        self, weights: Mapping[str, Tensor], theta: Tensor, key: tuple[int | str, ...]
+    ) -> Tensor:
+        policy = copy.deepcopy(self.learner.policy)
+        policy.load_state_dict(weights)
+        return self._apart(policy, theta, trajectories=self.episodes, key=key)
+
+    def _replay(self, real: TensorDictBase, theta: Tensor, key: tuple[int | str, ...]) -> Tensor:
+        """Environment i replays the actions of log i mod n, and is cut where that log ends."""
+        steps, rows = real.shape[1], self.settings["environments"]
+        if rows % len(real):
+            raise ValueError(
+                message(
+                    f"environments in multiples of the {len(real)} logs, whose actions they replay",
+                    rows,
+                    hint=f"{-(-rows // len(real)) * len(real)} environments",
+                )
+            )
+        cut = real.get("mask")[torch.arange(rows) % len(real)]
+
+        def statistics(batch: TensorDictBase) -> TensorDictBase:
+            batch = first_trajectories(batch.reshape(-1, steps))
+            return self.statistics(batch.set("mask", batch.get("mask") & cut))
+
+        policy = ReplayActions(real.get("action"))
+        return self._apart(
+            policy, theta, steps=steps, statistics=statistics, trajectories=len(real), key=key
+        )
+
+    def _apart(
+        self,
+        policy: TensorDictModuleBase,
+        theta: Tensor,
+        *,
+        trajectories: int,
+        key: tuple[int | str, ...],
+        steps: int | None = None,
+        statistics: Callable[[TensorDictBase], TensorDictBase] | None = None,
+    ) -> Tensor:
+        """Simulate with a policy that is not the learner's present one."""
+        collector = self._make_collector(policy, steps or self.horizon)
+        try:
+            summaries, _ = collect_summaries(
+                collector,
+                statistics or self.statistics,
+                self.randomizer,
+                theta,
+                trajectories=trajectories,
+                key=key,
+                progress=self.progress,
+            )
+        finally:
+            collector.shutdown(close_env=False)
+        return summaries
+
+    # Keeping work.
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything the rest of the run depends on: tensors and plain values."""
+        return {
+            "loop": dict(self._state),
+            "learner": self.learner.state_dict(),
+            "refinement": self.refinement.state_dict(),
+            "randomizer": self.randomizer.get_extra_state(),
+            "settings": self.settings,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state, to the numbers of the unbroken run.
+
+        Raises:
+            ValueError: If the state was made with other settings.
+        """
+        for name, value in self.settings.items():
+            if state["settings"].get(name) != value:
+                raise ValueError(
+                    message(
+                        f"a checkpoint made with {name}={value!r}",
+                        state["settings"].get(name),
+                        hint="the settings of the run that wrote it, or a new run",
+                    )
+                )
+        self._state = dict(state["loop"])
+        self.learner.load_state_dict(state["learner"])
+        self.refinement.load_state_dict(state["refinement"])
+        self.randomizer.set_extra_state(dict(state["randomizer"]))
+
+    def resume(self) -> bool:
+        """Load ``checkpoint_file`` if it exists; return whether it did."""
+        if self.checkpoint_file is None or not self.checkpoint_file.exists():
+            return False
+        self.load_state_dict(checkpoint.load(self.checkpoint_file))
+        return True
+
+    def _keep(self) -> None:
+        if self.checkpoint_file is not None:
+            checkpoint.save(self.checkpoint_file, self.state_dict())
+
+
+_FRESH: dict[str, Any] = {"update": -1, "curve": [], "seconds": 0.0}
+
+
+def ended_return(batch: TensorDictBase) -> float:
+    """Return the mean return of the episodes that ended in a batch with ``RewardSum``'s entry."""
+    total = batch.get(("next", "episode_reward"), None)
+    if total is None:
+        return float("nan")
+    ended = total[batch.get(("next", "done"))]
+    return ended.mean().item() if ended.numel() else float("nan")
+
+
+def _flatten(trajectories: TensorDictBase) -> dict[str, Tensor]:
+    keys = ["observation", "action", "mask"]
+    kept = [*keys, ("next", "observation"), ("next", "reward"), ("next", "done")]
+    flat = trajectories.select(*kept, strict=False).flatten_keys(".")
+    return {str(name): value.contiguous() for name, value in flat.items()}
+
+
+def _unflatten(entries: Mapping[str, Tensor]) -> TensorDictBase:
+    return TensorDict(dict(entries), batch_size=entries["mask"].shape).unflatten_keys(".")
