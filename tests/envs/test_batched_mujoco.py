@@ -142,6 +142,27 @@ def test_a_divergence_is_flagged_and_contained(tmp_path, monkeypatch, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+def test_impossible_physics_harm_only_their_environment(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    sick, well = (BatchedMujocoEnv("Hopper-v5", 3, threads=1) for _ in range(2))
+    for body in range(1, 5):
+        sick.models.write("body_mass", (body,), np.array([3.0, 0.0, 3.0]))
+        well.models.write("body_mass", (body,), np.full(3, 3.0))
+        for axis in range(3):
+            sick.models.write("body_inertia", (body, axis), np.array([0.1, 0.0, 0.1]))
+            well.models.write("body_inertia", (body, axis), np.full(3, 0.1))
+    rows = []
+    for env in (sick, well):
+        env.models.refresh()
+        td = env.reset()
+        td["action"] = env.action_spec.zero()
+        rows.append(env.step(td)["next"])
+    assert rows[0]["diverged"][:, 0].tolist() == [False, True, False]
+    for row in (0, 2):
+        assert (rows[0]["observation"][row] == rows[1]["observation"][row]).all()
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_divergence_in_an_open_loop_leaves_nan():
     env = BatchedMujocoEnv("HalfCheetah-v5", 2, threads=1)
     env.reset()
