@@ -56,8 +56,8 @@ def differences(state: Tensor, next_state: Tensor, angles: Sequence[int] = ()) -
     r"""Return :math:`\tau_t`, wrapped to :math:`[-\pi, \pi)` in the columns ``angles``."""
     tau = next_state - state
     if angles:
-        wrapped = torch.remainder(tau[..., list(angles)] + math.pi, 2 * math.pi) - math.pi
-        tau = tau.index_copy(-1, torch.as_tensor(list(angles)), wrapped)
+        turns = tau[..., list(angles)]
+        tau[..., list(angles)] = torch.remainder(turns + math.pi, 2 * math.pi) - math.pi
     return tau
 
 
@@ -160,7 +160,7 @@ def linear_dynamics(state: Tensor, action: Tensor, next_state: Tensor, mask: Ten
     The coefficients W of :math:`\tau_t \approx W [s_t, a_t, 1]` and the logarithm of each output's
     residual variance. The coefficients depend on the physics and hardly on the policy, which makes
     them sharper than correlations wherever the dynamics are smooth. A ridge of 1e-6 of each
-    regressor's own power keeps short trajectories and constant columns harmless.
+    regressor's own variance keeps short trajectories and constant columns harmless.
 
     Example:
         >>> s = torch.cumsum(torch.randn(1, 65, 1), -2)
@@ -169,19 +169,26 @@ def linear_dynamics(state: Tensor, action: Tensor, next_state: Tensor, mask: Ten
         >>> linear_dynamics(s[:, :-1], a, s[:, 1:], mask)[0, :2].round(decimals=3)
         tensor([-0.1000,  1.0000])
     """
-    ones = torch.ones_like(state[..., :1])
-    keep = mask.unsqueeze(-1)
-    regressors = torch.where(keep, torch.cat([state, action, ones], -1), 0.0).double()
-    tau = torch.where(keep, next_state - state, 0.0).double()
     count = mask.sum(-1).clamp_min(1)[..., None, None]
+
+    def centred(values: Tensor) -> tuple[Tensor, Tensor]:
+        values = torch.where(mask.unsqueeze(-1), values, 0.0).double()
+        mean = values.sum(-2, keepdim=True) / count
+        return torch.where(mask.unsqueeze(-1), values - mean, 0.0), mean
+
+    # centred, so that the ridge does not grow with the distance of a state from its origin
+    regressors, mean = centred(torch.cat([state, action], -1))
+    tau, drift = centred(next_state - state)
     gram = regressors.mT @ regressors / count
     power = gram.diagonal(dim1=-2, dim2=-1)
     gram = gram + torch.diag_embed(1e-6 * power + 1e-12)
     solution, _ = torch.linalg.solve_ex(gram, regressors.mT @ tau / count)
+    constant = drift - mean @ solution
     residual = (tau - regressors @ solution).square().sum(-2) / count.squeeze(-1)
-    scale = tau.square().sum(-2) / count.squeeze(-1)
+    scale = tau.square().sum(-2) / count.squeeze(-1) + drift.squeeze(-2).square()
     left = ((residual + 1e-12) / (scale + 1e-12)).log()
-    return torch.cat([solution.mT.flatten(-2), left], -1).to(state.dtype)
+    coefficients = torch.cat([solution, constant], -2).mT.flatten(-2)
+    return torch.cat([coefficients, left], -1).to(state.dtype)
 
 
 def pool_trajectories(summaries: Tensor) -> Tensor:
@@ -221,7 +228,7 @@ class SummaryStatistics(TensorDictModuleBase):
         out_key: Key of the summary.
 
     Raises:
-        ValueError: For no functions.
+        ValueError: For no functions; in a call, for discrete actions given as indices.
 
     Example:
         >>> from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
@@ -252,7 +259,16 @@ class SummaryStatistics(TensorDictModuleBase):
         if "mask" not in tensordict.keys():  # noqa: SIM118 (TensorDict iterates rows)
             tensordict = first_trajectories(tensordict)
         state, mask = tensordict.get(self.observation_key), tensordict.get("mask")
-        action = encode_actions(tensordict.get(self.action_key))
+        action = tensordict.get(self.action_key)
+        if action.ndim == mask.ndim or (action.shape[-1] == 1 and not action.is_floating_point()):
+            raise ValueError(
+                message(
+                    "one-hot actions or torques, of shape (*, T, A)",
+                    f"indices of shape {tuple(action.shape)}",
+                    hint="an environment with categorical_action_encoding=False",
+                )
+            )
+        action = encode_actions(action)
         # angles are unwrapped through their wrapped differences, once, for every summary
         tau = differences(state, tensordict.get(_next(self.observation_key)), self.angles)
         parts = [function(state, action, state + tau, mask) for function in self.functions]
