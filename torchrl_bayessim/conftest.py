@@ -5,6 +5,8 @@ from collections.abc import Iterator
 import pytest
 import torch
 
+torch.set_num_threads(1)  # small tensors: a second thread costs more than it brings
+
 
 @pytest.fixture(autouse=True)
 def _doctest(doctest_namespace: dict[str, object]) -> Iterator[None]:

@@ -20,9 +20,7 @@ class SimulationError(BayesSimError):
     """Simulations diverged, or none of them can be used."""
 
 
-def message(
-    expected: str, got: object, *, available: Iterable[object] = (), hint: str = ""
-) -> str:
+def message(expected: str, got: object, *, available: Iterable[object] = (), hint: str = "") -> str:
     """Return the one-line message ``expected …, got …. Available: …. Try: …``.
 
     With ``available`` names and a string ``got``, the nearest names are put first.

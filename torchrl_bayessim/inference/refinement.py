@@ -14,6 +14,7 @@ __all__ = ["PosteriorRefinement"]
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import torch
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -46,7 +47,7 @@ class PosteriorRefinement:
 
     Example:
         >>> prior = BoxPrior({"a": (-1.0, 1.0)})
-        >>> refinement = PosteriorRefinement(prior, simulations=256,
+        >>> refinement = PosteriorRefinement(prior, simulations=512,
         ...                                  fit_options={"epochs": 60, "progress": False})
         >>> for turn in range(2):  # x = theta, so the posterior is as sharp as the network is
         ...     report = refinement.refine(lambda theta: theta, torch.tensor([0.5]), key=(turn,))
