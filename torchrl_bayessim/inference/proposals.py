@@ -128,8 +128,8 @@ class HighestDensityPrior:
         posterior: Whose highest-density region is used.
         mass: Probability of the region under the posterior.
         seed: Of the estimates of the threshold c and of the region's prior volume.
-        tries: At most so many batches of prior draws per sample; then draws of the posterior
-            within the region fill the rest, with a warning.
+        tries: At most so many batches of prior draws per sample; then draws of the posterior,
+            resampled to the prior's density, fill the rest, with a warning.
     """
 
     def __init__(
@@ -141,17 +141,22 @@ class HighestDensityPrior:
         seed: int = 0,
         tries: int = 64,
     ) -> None:
-        self.prior, self.posterior, self.tries = prior, posterior, tries
-        self.names = prior.names
+        # in a box prior the search is confined to the box around the posterior
+        self.prior = (
+            focus(prior, posterior, margin=0.25, seed=seed)
+            if isinstance(prior, BoxPrior)
+            else prior
+        )
+        self.names, self.posterior, self.tries = prior.names, posterior, tries
         draws = draw(posterior, 8192, key=(seed, "region"))
         self.threshold = posterior.log_prob(draws).quantile(1 - mass).item()
-        inside = self.contains(draw(prior, 65536, key=(seed, "volume")))
+        inside = self.contains(draw(self.prior, 65536, key=(seed, "volume")))
         # half a point keeps a region smaller than the sample from having volume zero
         self.log_volume = math.log((inside.sum().item() + 0.5) / (len(inside) + 0.5))
 
     def contains(self, theta: Tensor) -> Tensor:
         """Return which parameters lie in the region, boolean, shape ``(*)``."""
-        return self.posterior.log_prob(theta) >= self.threshold
+        return self.prior.contains(theta) & (self.posterior.log_prob(theta) >= self.threshold)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-density, ``-inf`` outside the region, shape ``(*)``."""
@@ -163,23 +168,32 @@ class HighestDensityPrior:
         count = torch.Size(shape).numel()
         kept: list[Tensor] = []
         missing = count
-        for source in [self.prior] * self.tries + [self.posterior] * self.tries:
-            if missing <= 0:
-                break
-            if source is self.posterior and len(kept) == self.tries:
-                warnings.warn("the region is too small for prior draws: used q's", stacklevel=2)
-            theta = source.sample((max(4 * count, 256),), generator=generator)  # pyright: ignore[reportCallIssue]
-            kept.append(theta[self.contains(theta)])
+        for _ in range(self.tries):
+            theta = self.prior.sample((max(4 * count, 256),), generator=generator)  # pyright: ignore[reportCallIssue]
+            kept.append(theta[self.contains(theta)][:missing])
             missing -= len(kept[-1])
-        if missing > 0:
-            raise SimulationError(message("draws inside the region", f"{count - missing}"))
-        return torch.cat(kept)[:count].reshape(*shape, -1)
+            if missing == 0:
+                break
+        else:
+            warnings.warn("the region is too small for prior draws: used q's", stacklevel=2)
+            kept.append(self._resampled(missing, generator))
+        return torch.cat(kept).reshape(*shape, -1)
+
+    def _resampled(self, count: int, generator: torch.Generator) -> Tensor:
+        """Return draws of q in the region, resampled by p / q, which is at most p / c there."""
+        theta = self.posterior.sample((max(64 * count, 8192),), generator=generator)
+        theta = theta[self.contains(theta)]
+        if len(theta) == 0:
+            raise SimulationError(message("draws inside the region", "none"))
+        weight = (self.prior.log_prob(theta) - self.posterior.log_prob(theta)).softmax(0)
+        return theta[torch.multinomial(weight, count, replacement=True, generator=generator)]
 
 
 def gaussian_proposal(posterior: PhysicsPosterior, *, inflate: float = 1.5) -> PhysicsPosterior:
     """Project a posterior onto one Gaussian by its moments, and widen its deviations.
 
-    The one proposal that :func:`analytic_correction` may divide by. It is not truncated.
+    The one proposal that :func:`analytic_correction` may divide by. In a box prior it is cut off at
+    the box, which a division does not notice.
     """
     points, weight = posterior.mixture.quadrature()
     mean = (weight.unsqueeze(-1) * points).sum(0)
@@ -214,14 +228,13 @@ def analytic_correction(
                 hint='correction="importance", which is right for mixtures',
             )
         )
-    quotient, repaired = divide(
-        Mixture(mixture.untruncated_logits, mixture.loc, mixture.scale_tril),
-        divisor.loc[0],
-        divisor.scale_tril[0] @ divisor.scale_tril[0].mT,
-    )
+    dividend = Mixture(mixture.untruncated_logits, mixture.loc, mixture.scale_tril)
     if learned.prior.box is None:  # the prior is N(0, I) here, not a constant
+        # before the division: a precision may need the prior's to stay positive
         identity = torch.eye(divisor.loc.shape[-1], dtype=divisor.loc.dtype)
-        quotient = _times_standard_normal(quotient, identity)
+        dividend = _times_standard_normal(dividend, identity)
+    covariance = divisor.scale_tril[0] @ divisor.scale_tril[0].mT
+    quotient, repaired = divide(dividend, divisor.loc[0], covariance)
     if repaired:
         text = f"{repaired} components were wider than the proposal and had to be repaired"
         warnings.warn(text, stacklevel=2)
