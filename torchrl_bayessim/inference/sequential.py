@@ -91,8 +91,6 @@ def sequential(
     history: list[tuple[Proposal, Tensor, Tensor]] = []
     for index in range(rounds):
         theta = draw(proposal, simulations, key=(seed, "theta", index))
-        inside = prior.contains(theta)  # a Gaussian proposal may leave a box
-        theta = theta[inside]
         history.append((proposal, theta, simulator(theta)))
         if correction == "analytic":
             history = history[-1:]

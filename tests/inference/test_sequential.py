@@ -1,0 +1,130 @@
+import itertools
+
+import pytest
+import torch
+
+from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
+from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
+from torchrl_bayessim.inference.sequential import sequential
+from torchrl_bayessim.randomness import generator
+
+BOX = BoxPrior({"theta": (-2.0, 2.0)})
+OBSERVED = torch.ones(1, 1)
+# patience as long as the fit, so that the cosine of the learning rate reaches its end
+FIT = {"epochs": 50, "patience": 50, "batch_size": 500, "lr": 5e-3, "progress": False}
+QUICK = {"epochs": 2, "batch_size": 64, "progress": False}
+every_correction = pytest.mark.parametrize("correction", ["importance", "truncated", "analytic"])
+
+
+def square(key, sd=0.2):
+    noise = generator("square", key)
+    return lambda theta: theta**2 + sd * torch.randn(theta.shape, generator=noise)
+
+
+def total_variation(posterior):
+    """To the exact posterior of x = theta^2 + N(0, 0.2^2) at x = 1, by the midpoint rule."""
+    step = 4 / 8000
+    theta = -2 + step * (torch.arange(8000, dtype=torch.float64) + 0.5)
+    exact = torch.softmax(-0.5 * ((1 - theta**2) / 0.2) ** 2, 0)
+    return 0.5 * (posterior.log_prob(theta[:, None]).exp() * step - exact).abs().sum().item()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@every_correction
+def test_three_rounds_find_both_modes(correction, seed):
+    """Where dividing by a mixture term by term loses one mode or ends in an indefinite matrix."""
+    rounds = sequential(
+        square(seed),
+        BOX,
+        OBSERVED,
+        rounds=3,
+        simulations=2000,
+        correction=correction,
+        seed=seed,
+        **FIT,
+    )
+    assert total_variation(list(rounds)[-1].posterior) <= 0.1
+
+
+@pytest.mark.parametrize("correction", ["importance", "analytic"])
+def test_a_linear_gaussian_problem_has_its_known_posterior(correction):
+    """theta ~ N(1, 2^2), x = theta + N(0, 0.5^2), observed x = 2."""
+    noise = generator("linear")
+    *_, last = sequential(
+        lambda theta: theta + 0.5 * torch.randn(theta.shape, generator=noise),
+        GaussianPrior({"theta": (1.0, 2.0)}),
+        torch.full((1, 1), 2.0),
+        rounds=2,
+        simulations=1000,
+        correction=correction,
+        make_posterior=lambda size: MixtureDensityPosterior(
+            GaussianPrior({"theta": (1.0, 2.0)}), size, components=1
+        ),
+        **FIT | {"batch_size": 100},
+    )
+    precision = 1 / 2.0**2 + 1 / 0.5**2
+    mean = (1.0 / 2.0**2 + 2.0 / 0.5**2) / precision
+    assert last.posterior.mean.item() == pytest.approx(mean, abs=0.1)
+    assert last.posterior.stddev.item() == pytest.approx(precision**-0.5, rel=0.12)
+
+
+@every_correction
+def test_the_same_seed_gives_the_same_rounds(correction):
+    def densities(seed):
+        options = {"rounds": 2, "simulations": 100, "correction": correction, "seed": seed}
+        rounds = sequential(square(0), BOX, OBSERVED, **options, **QUICK)
+        return [r.posterior.log_prob(torch.tensor([[-0.5], [1.0]])) for r in rounds]
+
+    before = torch.random.get_rng_state()
+    first, again, other = densities(3), densities(3), densities(4)
+    assert torch.equal(torch.stack(first), torch.stack(again))
+    assert not torch.equal(torch.stack(first), torch.stack(other))
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_rounds_belong_to_the_caller_and_later_ones_simulate_where_the_posterior_is():
+    asked = []
+
+    def simulator(theta):
+        asked.append(theta)
+        return square(0)(theta)
+
+    rounds = sequential(
+        simulator, BOX, OBSERVED, rounds=100, simulations=500, **FIT | {"batch_size": 50}
+    )
+    found = list(itertools.islice(rounds, 2))
+    assert [r.index for r in found] == [0, 1]
+    assert [len(theta) for theta in asked] == [500] * 2  # the caller stopped: no third
+    first, second = (((theta.abs() - 1).abs() < 0.3).float().mean().item() for theta in asked)
+    assert first == pytest.approx(0.3, abs=0.06)
+    assert second > 0.6
+    assert found[0].effective_pairs == pytest.approx(500)
+    for index, r in enumerate(found):
+        assert r.fit.pairs == 500 * (index + 1)
+        assert 0.2 * r.fit.pairs < r.effective_pairs <= r.fit.pairs
+    assert all(BOX.contains(theta).all() for theta in asked)
+
+
+def test_simulations_that_diverge_are_left_out_and_counted():
+    def simulator(theta):
+        return torch.where(theta > 1.9, torch.nan, theta**2)
+
+    rounds = sequential(simulator, BOX, OBSERVED, rounds=1, simulations=400, **QUICK)
+    with pytest.warns(UserWarning, match="simulations are not finite"):
+        (only,) = rounds
+    assert 0 < only.fit.dropped < 40
+    assert only.fit.pairs == 400 - only.fit.dropped
+
+
+def test_the_analytic_correction_trains_on_the_last_round_alone():
+    *_, last = sequential(
+        square(0), BOX, OBSERVED, rounds=2, simulations=300, correction="analytic", **QUICK
+    )
+    assert last.fit.pairs == 300
+    assert last.effective_pairs == pytest.approx(300)
+
+
+def test_an_unknown_correction_is_refused():
+    rounds = sequential(square(0), BOX, OBSERVED, rounds=1, simulations=9, correction="snpe")
+    with pytest.raises(ValueError, match=r"expected a correction.*snpe.*importance.*truncated"):
+        next(rounds)
