@@ -44,7 +44,7 @@ class Sim2Real(recipe.Settings):
     task: str = "cartpole"
     truth: str = "nominal"  # or "random": drawn from the prior by the seed
     rounds: int = 3
-    episodes: int = 8  # real episodes per round
+    episodes: int = 4  # real episodes per round
     simulations: int = 1024  # pairs per round
     updates: int = 0  # PPO updates per round; 0 for the task's own number
     baseline: bool = True  # also train under the prior, with as many frames
@@ -130,6 +130,7 @@ def make_loop(
         horizon=task.horizon,
         episodes=settings.episodes,
         updates=settings.updates or task.updates,
+        shared_batches=task.shared_batches,
         rounds=settings.rounds,
         seed=settings.seed,
         checkpoint_file=out / "checkpoint.pt",
@@ -254,15 +255,19 @@ def draw_pictures(
     result: dict[str, Any],
     curves: dict[str, list[dict[str, float]]],
 ) -> None:
-    """Write posterior.png, learning.png and return.png."""
-    figure = plots.pair_plot(
-        draw(turn.posterior, 4000, key=("picture",)),
-        names=task.prior.names,
-        units=task.prior.units,
-        prior_samples=draw(task.prior, 4000, key=("picture", "prior")),
-        truth=torch.tensor(result["true"]),
-    )
-    figure.savefig(out / "posterior.png", dpi=150)
+    """Write posterior.png (also zoomed), learning.png and return.png."""
+    samples = draw(turn.posterior, 4000, key=("picture",))
+    prior_samples = draw(task.prior, 4000, key=("picture", "prior"))
+    for name, zoom in {"posterior": False, "posterior_zoom": True}.items():
+        figure = plots.pair_plot(
+            samples,
+            names=task.prior.names,
+            units=task.prior.units,
+            prior_samples=prior_samples,
+            truth=torch.tensor(result["true"]),
+            zoom=zoom,
+        )
+        figure.savefig(out / f"{name}.png", dpi=150)
     lines = {
         f"trained under the {name}": (
             torch.tensor([point["frames"] for point in curve if ended(point)]),

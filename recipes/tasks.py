@@ -37,7 +37,8 @@ class Task:
         max_steps: Length of an episode.
         environments: Environments that train.
         horizon: Steps per batch and per summarised trajectory.
-        updates: Learner updates per round.
+        updates: Learner updates per round under the posterior.
+        shared_batches: Batches per round that serve inference and the learner.
         ppo: PPO's settings.
         summaries: Statistics of trajectories.
     """
@@ -47,9 +48,10 @@ class Task:
     truth: Mapping[str, float]
     physics: Callable[[], Physics]
     max_steps: int
-    environments: int = 256
+    environments: int = 128
     horizon: int = 128
-    updates: int = 4
+    updates: int = 8
+    shared_batches: int = 4
     ppo: Mapping[str, Any] = field(default_factory=dict)
     summaries: Sequence[Summary] = (linear_dynamics, duration)
 
@@ -80,6 +82,10 @@ TASKS: dict[str, Task] = {
         truth={"dt": 0.05},
         physics=lambda: AttributePhysics("dt"),
         max_steps=200,
+        environments=64,
+        horizon=100,
+        updates=12,
+        ppo={"minibatch_size": 640, "gamma": 0.98, "reward_scale": 0.1},
     ),
     "mountain_car": Task(
         simulator=lambda n, seed: MountainCarContinuousEnv(n, seed=seed),
@@ -87,6 +93,11 @@ TASKS: dict[str, Task] = {
         truth={"power": 0.0015},
         physics=lambda: AttributePhysics("power"),
         max_steps=999,
+        environments=32,
+        horizon=256,
+        updates=6,
+        shared_batches=2,
+        ppo={"initial_std": 1.0, "reward_scale": 0.1},
     ),
     "acrobot": Task(
         simulator=lambda n, seed: AcrobotEnv(n, seed=seed),
@@ -109,6 +120,8 @@ TASKS: dict[str, Task] = {
             "LINK_MASS_1", "LINK_MASS_2", "LINK_LENGTH_1", "LINK_LENGTH_2"
         ),
         max_steps=500,
+        environments=64,
+        ppo={"reward_scale": 0.1},
     ),
     "hopper": Task(
         simulator=lambda n, seed: BatchedMujocoEnv("Hopper-v5", n, seed=seed),
@@ -121,5 +134,9 @@ TASKS: dict[str, Task] = {
             friction=("geom_friction[floor,0]", "geom_friction[foot_geom,0]"),
         ),
         max_steps=1000,
+        environments=64,
+        updates=24,
+        shared_batches=2,
+        ppo={"minibatch_size": 256, "learning_rate": 5e-4, "reward_scale": 0.1},
     ),
 }

@@ -10,7 +10,7 @@ Each round (BayesSim, arXiv:1906.01728, fig. 1, made iterative):
    and from new ones.
 
 Summaries depend on the policy. So each parameter vector is simulated under every policy that made
-real data, as many trajectories each as the robot ran, and the network sees the pooled summaries
+real data, as many trajectories each as the robot ran, and the network sees one summary per policy
 side by side. Recorded logs are simulated by replaying their actions.
 """
 
@@ -43,7 +43,7 @@ from .randomness import isolated, seed_from
 from .robots import RealSystem
 from .simulate import ReplayActions, collect_summaries
 from .sources import Defensive
-from .summaries import SummaryStatistics, pool_trajectories
+from .summaries import SummaryStatistics
 from .trajectories import concatenate, first_trajectories
 from .transforms import DomainRandomizer
 
@@ -158,8 +158,9 @@ class SimToRealLoop:
         self.settings |= {
             "updates": updates,
             "shared_batches": shared_batches,
+            "defensive": defensive,
             "simulations": refinement.simulations,
-            "names": list(refinement.prior.names),
+            "prior": repr(refinement.prior),
             "seed": seed,
         }
         self.env, self.learner, self.robot = env, learner, robot
@@ -188,9 +189,11 @@ class SimToRealLoop:
     # One round, in steps after each of which the state is kept.
 
     def _turn(self) -> Round:
-        state = self._state
-        if state["update"] < 0:
+        if self._state["real"] is None:
+            self._step(self._measure)
+        if self._state["fit"] is None:
             self._step(self._infer)
+        state: dict[str, Any] = self._state
         posterior = self.refinement.posterior
         assert posterior is not None  # _infer has refined it
         self.randomizer.source = Defensive(posterior, self.refinement.prior, self.defensive)
@@ -213,16 +216,42 @@ class SimToRealLoop:
         self._state["seconds"] += time.monotonic() - start
         self._keep()
 
+    def _measure(self) -> None:
+        """Ask the robot; a step of its own, because a robot's time is worth keeping."""
+        state, policy = self._state, self.learner.policy
+        key = (self.seed, "round", state["round"])
+        real = self.robot.rollouts(policy, episodes=self.episodes, key=key)
+        if not self.robot.recorded:
+            real = self._comparable(real)
+        evidence: list[dict[str, Any]] = [] if self.robot.recorded else state["evidence"]
+        new = {
+            "policy": dict(copy.deepcopy(policy).state_dict()),
+            "episodes": len(real),
+            "summary": self.statistics.together(real),
+        }
+        kept = real.select(*self.statistics.in_keys, "mask", ("next", "reward"), strict=False)
+        state |= {"evidence": [*evidence, new], "real": _flatten(kept)}
+
+    def _comparable(self, real: TensorDictBase) -> TensorDictBase:
+        """Cut real episodes where simulated ones are cut; refuse those that were cut before."""
+        real = real[:, : self.horizon]
+        mask: Tensor = real.get("mask")
+        ended = (real.get(("next", "done")).reshape(mask.shape) & mask).any(-1)
+        length = mask.sum(-1)
+        short = ~ended & (length < self.horizon)
+        if short.any():
+            raise ValueError(
+                message(
+                    f"real episodes that end, or last the {self.horizon} steps of simulated ones",
+                    f"one cut after {int(length[short].min())}",
+                    hint="the same horizon for the loop and the robot",
+                )
+            )
+        return real
+
     def _infer(self) -> None:
         state, key = self._state, (self.seed, "round", self._state["round"])
-        real = self.robot.rollouts(self.learner.policy, episodes=self.episodes, key=key)
-        evidence: list[dict[str, Any]] = [] if self.robot.recorded else list(state["evidence"])
-        evidence.append(
-            {
-                "policy": dict(copy.deepcopy(self.learner.policy).state_dict()),
-                "summary": pool_trajectories(self.statistics(real).get("summary")),
-            }
-        )
+        evidence = state["evidence"]
         shared: list[TensorDictBase] = []
 
         def simulate(theta: Tensor) -> Tensor:
@@ -230,23 +259,18 @@ class SimToRealLoop:
             for index, entry in enumerate(evidence):
                 where = (*key, "evidence", index)
                 if self.robot.recorded:
-                    parts.append(self._replay(real, theta, where))
+                    parts.append(self._replay(_unflatten(state["real"]), theta, where))
                 elif index < len(evidence) - 1:
-                    parts.append(self._repeat(entry["policy"], theta, where))
+                    parts.append(self._repeat(entry, theta, where))
                 else:
-                    part, batches = self._simulate(theta, where)
+                    part, batches = self._simulate(entry, theta, where)
                     parts.append(part)
                     shared.extend(batches)
             return torch.cat(parts, -1)
 
         observed = torch.cat([entry["summary"] for entry in evidence], -1)
         report = self.refinement.refine(simulate, observed, key=key)
-        state |= {
-            "evidence": evidence,
-            "real": _flatten(real),
-            "fit": dataclasses.asdict(report),
-            "update": 0,
-        }
+        state["fit"] = dataclasses.asdict(report)
         if shared:  # collected with this very policy: the learner's first update of the round
             self._update(concatenate(shared))
 
@@ -262,8 +286,8 @@ class SimToRealLoop:
         label = f"round {state['round'] + 1} of {self.rounds}: train"
         for update in tqdm(range(first, last), desc=label, disable=not self.progress, leave=False):
             with isolated(*key, update):
-                batch = self._collect().next()
-            self._update(batch)
+                batch: Any = self._collect().next()
+            self._update(batch.reshape(-1, batch.shape[-1]))
         state["update"] = last
 
     def _update(self, batch: TensorDictBase) -> None:
@@ -293,25 +317,25 @@ class SimToRealLoop:
         )
 
     def _simulate(
-        self, theta: Tensor, key: tuple[int | str, ...]
+        self, entry: Mapping[str, Any], theta: Tensor, key: tuple[int | str, ...]
     ) -> tuple[Tensor, list[TensorDictBase]]:
         return collect_summaries(
             self._collect(),
             self.statistics,
             self.randomizer,
             theta,
-            trajectories=self.episodes,
+            trajectories=entry["episodes"],
             key=key,
             keep=self.shared_batches,
             progress=self.progress,
         )
 
     def _repeat(
-        self, weights: Mapping[str, Tensor], theta: Tensor, key: tuple[int | str, ...]
+        self, entry: Mapping[str, Any], theta: Tensor, key: tuple[int | str, ...]
     ) -> Tensor:
         policy = copy.deepcopy(self.learner.policy)
-        policy.load_state_dict(weights)
-        return self._apart(policy, theta, trajectories=self.episodes, key=key)
+        policy.load_state_dict(entry["policy"])
+        return self._apart(policy, theta, trajectories=entry["episodes"], key=key)
 
     def _replay(self, real: TensorDictBase, theta: Tensor, key: tuple[int | str, ...]) -> Tensor:
         """Environment i replays the actions of log i mod n, and is cut where that log ends."""
@@ -326,13 +350,13 @@ class SimToRealLoop:
             )
         cut = real.get("mask")[torch.arange(rows) % len(real)]
 
-        def statistics(batch: TensorDictBase) -> TensorDictBase:
+        def prepare(batch: TensorDictBase) -> TensorDictBase:
             batch = first_trajectories(batch.reshape(-1, steps))
-            return self.statistics(batch.set("mask", batch.get("mask") & cut))
+            return batch.set("mask", batch.get("mask") & cut)
 
         policy = ReplayActions(real.get("action"))
         return self._apart(
-            policy, theta, steps=steps, statistics=statistics, trajectories=len(real), key=key
+            policy, theta, steps=steps, prepare=prepare, trajectories=len(real), key=key
         )
 
     def _apart(
@@ -343,18 +367,19 @@ class SimToRealLoop:
         trajectories: int,
         key: tuple[int | str, ...],
         steps: int | None = None,
-        statistics: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        prepare: Callable[[TensorDictBase], TensorDictBase] = first_trajectories,
     ) -> Tensor:
         """Simulate with a policy that is not the learner's present one."""
         collector = self._make_collector(policy, steps or self.horizon)
         try:
             summaries, _ = collect_summaries(
                 collector,
-                statistics or self.statistics,
+                self.statistics,
                 self.randomizer,
                 theta,
                 trajectories=trajectories,
                 key=key,
+                prepare=prepare,
                 progress=self.progress,
             )
         finally:
@@ -405,7 +430,7 @@ class SimToRealLoop:
             checkpoint.save(self.checkpoint_file, self.state_dict())
 
 
-_FRESH: dict[str, Any] = {"update": -1, "curve": [], "seconds": 0.0}
+_FRESH: dict[str, Any] = {"real": None, "fit": None, "update": 0, "curve": [], "seconds": 0.0}
 
 
 def ended_return(batch: TensorDictBase) -> float:
@@ -418,9 +443,7 @@ def ended_return(batch: TensorDictBase) -> float:
 
 
 def _flatten(trajectories: TensorDictBase) -> dict[str, Tensor]:
-    keys = ["observation", "action", "mask"]
-    kept = [*keys, ("next", "observation"), ("next", "reward"), ("next", "done")]
-    flat = trajectories.select(*kept, strict=False).flatten_keys(".")
+    flat = trajectories.flatten_keys(".")
     return {str(name): value.contiguous() for name, value in flat.items()}
 
 

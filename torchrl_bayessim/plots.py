@@ -36,6 +36,7 @@ def pair_plot(
     units: Sequence[str] | None = None,
     prior_samples: Tensor | None = None,
     truth: Tensor | None = None,
+    zoom: bool = False,
 ) -> Figure:
     """Draw marginals on the diagonal and pairs below it, as densities with contours.
 
@@ -48,6 +49,7 @@ def pair_plot(
         units: Unit of each parameter; an empty string for none.
         prior_samples: Prior draws, shape ``(S', D)``, drawn in grey; they set the axes.
         truth: The true parameters where known, shape ``(D,)``.
+        zoom: Let the posterior set the axes, when it is too narrow to be seen beside the prior.
 
     Raises:
         ValueError: Shapes do not agree, or a value is not finite.
@@ -64,7 +66,7 @@ def pair_plot(
     if len(units) != len(names):
         raise ValueError(message("one unit per name", f"{len(units)} for {len(names)} names"))
     labels = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)]
-    limits = _limits(points if prior is None else prior, true)
+    limits = _limits(points if prior is None or zoom else prior, true)
     d = len(names)
     figure = _figure(width=max(3.4, 2.1 * d + 0.6), height=max(3.0, 2.0 * d + 0.5))
     grid = figure.add_gridspec(d, d, hspace=0.08, wspace=0.08)
@@ -203,6 +205,12 @@ def return_per_round(
     axes.set_ylabel(ylabel)
     axes.grid(axis="y", color=_LIGHT, lw=0.6)
     axes.margins(y=0.15)
+    # a difference of less than a twentieth of the return should not fill the picture
+    low, high = axes.get_ylim()
+    least = 0.05 * max(abs(low), abs(high))
+    if high - low < least:
+        middle = (low + high) / 2
+        axes.set_ylim(middle - least / 2, middle + least / 2)
     axes.legend(frameon=False, fontsize=9, loc="best")
     return figure
 

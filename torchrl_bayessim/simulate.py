@@ -20,10 +20,11 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
-from .errors import message
+from .errors import PhysicsError, message
 from .randomness import isolated, seed_from
 from .sources import Grid, draw
-from .summaries import SummaryStatistics, pool_trajectories
+from .summaries import SummaryStatistics
+from .trajectories import concatenate, first_trajectories
 from .transforms import DomainRandomizer
 
 
@@ -72,55 +73,84 @@ class ReplayActions(TensorDictModuleBase):
 
 def collect_summaries(
     collector: BaseCollector,
-    statistics: Callable[[TensorDictBase], TensorDictBase],
+    statistics: SummaryStatistics,
     randomizer: DomainRandomizer,
     theta: Tensor,
     *,
     trajectories: int = 1,
     key: tuple[int | str, ...],
+    prepare: Callable[[TensorDictBase], TensorDictBase] = first_trajectories,
     keep: int = 0,
     progress: bool = True,
 ) -> tuple[Tensor, list[TensorDictBase]]:
-    """Return the pooled summaries of simulations at ``theta``, and the first ``keep`` batches.
+    """Return the summaries of simulations at ``theta``, and the first ``keep`` batches.
 
     Each parameter vector is given to as many environments as there are ``trajectories`` per pair,
-    whose summaries are then pooled. Before every batch all environments are reset, and only each
+    which are summarised together. Before every batch all environments are reset, and only each
     row's first trajectory counts: see :func:`.trajectories.first_trajectories`.
 
     Args:
         collector: Whose policy made the real data.
-        statistics: Trajectories ``[*, T]`` to ``{"summary": (*, L)}``.
+        statistics: Summaries.
         randomizer: Of the collector's environment; it has its source back afterwards.
         theta: Parameters to simulate, shape ``(N, D)``.
         trajectories: Number n of trajectories per pair: as many as the robot ran.
         key: What the simulations are for: same key, same summaries (for a direct collector).
+        prepare: Gives a batch its ``"mask"``.
         keep: Number of batches to return.
         progress: Whether to show a progress bar.
 
     Returns:
-        Summaries of shape ``(N, L)``, or ``(N, 2 L)`` for n > 1; and the batches.
+        Summaries of shape ``(N, L)``; and the batches.
+
+    Raises:
+        PhysicsError: The batches were not simulated at ``theta``.
     """
     source = randomizer.source
     rows = theta.repeat_interleave(trajectories, 0)
     found: list[Tensor] = []
     kept: list[TensorDictBase] = []
+    waiting: list[TensorDictBase] = []  # rows of a parameter vector that is not complete yet
     done, index = 0, 0
     bar = tqdm(total=len(theta), desc="simulate", disable=not progress, leave=False, unit="pair")
-    with bar:
+    try:
         while done < len(rows):
             randomizer.source = Grid(rows[done:])
             with isolated(*key, index):
                 collector.set_seed(seed_from(*key, index, "env") % 2**31)
                 collector.reset()
                 batch: Any = collector.next()
+            batch = batch.reshape(-1, batch.shape[-1])
+            _check_held(batch.get(randomizer.key, None), rows[done:])
             if index < keep:
                 kept.append(batch.clone())
-            found.append(statistics(batch).get("summary").flatten(0, -2)[: len(rows) - done])
-            done, index = done + len(found[-1]), index + 1
+            new = prepare(batch)[: len(rows) - done].select(*statistics.in_keys, "mask")
+            done, index = done + len(new), index + 1
+            ready: Any = concatenate([*waiting, new.clone()])
+            whole = len(ready) // trajectories
+            waiting = [ready[whole * trajectories :]]
+            if whole:
+                groups = ready[: whole * trajectories].unflatten(0, (whole, trajectories))
+                found.append(statistics.together(groups))
             bar.update(done // trajectories - bar.n)
-    randomizer.source = source
-    summaries = torch.cat(found).unflatten(0, (len(theta), trajectories))
-    return pool_trajectories(summaries), kept
+    finally:
+        randomizer.source = source
+        bar.close()
+    return torch.cat(found), kept
+
+
+def _check_held(theta: Tensor | None, rows: Tensor) -> None:
+    """Compare the parameters recorded at the start of each row with those asked for."""
+    held = torch.empty(0, rows.shape[-1]) if theta is None else theta[:, 0].cpu()
+    asked = rows[torch.arange(len(held)) % len(rows)]
+    if theta is None or not torch.allclose(held, asked, rtol=1e-6, atol=1e-12):
+        raise PhysicsError(
+            message(
+                f"simulations at the parameters asked for, {rows[0].tolist()} first",
+                "none recorded" if theta is None else f"{held[0].tolist()} first",
+                hint="the collector's own randomizer, in this process, and not pinned",
+            )
+        )
 
 
 def simulate(
@@ -144,7 +174,7 @@ def simulate(
         randomizer: Draws the parameters: its source is where they come from.
         pairs: Number of pairs wanted.
         max_steps: Steps after which a trajectory is cut.
-        trajectories: Number of trajectories per pair, whose summaries are pooled.
+        trajectories: Number of trajectories per pair, which are summarised together.
         seed: Same seed, same pairs.
         progress: Whether to show a progress bar.
 

@@ -20,12 +20,12 @@ __all__ = [
     "encode_actions",
     "linear_dynamics",
     "moments",
-    "pool_trajectories",
     "waypoints",
 ]
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -191,29 +191,6 @@ def linear_dynamics(state: Tensor, action: Tensor, next_state: Tensor, mask: Ten
     return torch.cat([coefficients, left], -1).to(state.dtype)
 
 
-def pool_trajectories(summaries: Tensor) -> Tensor:
-    """Summarise n trajectories of one system together: mean and spread of their summaries.
-
-    A network trained on such pooled summaries gives the posterior of all n trajectories at once,
-    however they depend on each other through its own errors; a product of n single-trajectory
-    posteriors multiplies those errors too. The order of the trajectories does not matter.
-
-    Args:
-        summaries: Shape ``(*, n, L)``.
-
-    Returns:
-        Shape ``(*, 2 L)``, or ``(*, L)`` for n = 1.
-
-    Example:
-        >>> pool_trajectories(torch.tensor([[1.0], [3.0]]))
-        tensor([2.0000, 1.4142])
-    """
-    mean = summaries.mean(-2)
-    if summaries.shape[-2] == 1:
-        return mean
-    return torch.cat([mean, summaries.std(-2)], -1)
-
-
 class SummaryStatistics(TensorDictModuleBase):
     """Summaries of a batch of trajectories: a TensorDict module, and a collector's ``postproc``.
 
@@ -252,6 +229,30 @@ class SummaryStatistics(TensorDictModuleBase):
         self.observation_key, self.action_key = observation_key, action_key
         self.in_keys = [observation_key, action_key, _next(observation_key), ("next", "done")]
         self.out_keys = [out_key]
+
+    def together(self, trajectories: TensorDictBase) -> Tensor:
+        """Return one summary of n trajectories of one system, ``[*, n, T]`` to ``(*, L)``.
+
+        The steps of all n count as those of one long trajectory (each difference lies within its
+        own), so regressions and correlations use all the data at once. A posterior learned on
+        such summaries is that of the n trajectories together; multiplying n single-trajectory
+        posteriors would multiply the network's errors too. Lags and waypoints run on from one
+        trajectory into the next.
+
+        Example:
+            >>> from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
+            >>> rows = first_trajectories(CartPoleEnv(8).rollout(50, break_when_any_done=False))
+            >>> SummaryStatistics(moments).together(rows.unflatten(0, (2, 4))).shape
+            torch.Size([2, 8])
+        """
+        mask = trajectories.get("mask")
+        # steps that do not count go to the end, as in any padded trajectory
+        order = (~mask.flatten(-2)).long().argsort(dim=-1, stable=True)
+        keys = [self.observation_key, self.action_key, _next(self.observation_key), "mask"]
+        flat: Any = trajectories.select(*keys).flatten(-2, -1)
+        index = (*torch.meshgrid(*(torch.arange(n) for n in order.shape[:-1]), indexing="ij"),)
+        rows = tuple(i.unsqueeze(-1) for i in index)
+        return self(flat[(*rows, order)]).get(self.out_keys[0])
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

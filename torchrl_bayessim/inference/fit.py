@@ -71,7 +71,7 @@ def fit(
     *,
     epochs: int = 300,
     batch_size: int = 128,
-    lr: float = 2e-3,
+    lr: float = 5e-3,
     weight_decay: float = 1e-4,
     validation_fraction: float = 0.1,
     patience: int = 30,

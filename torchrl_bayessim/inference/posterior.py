@@ -237,7 +237,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         prior: Prior,
         summary_dim: int,
         *,
-        components: int = 6,
+        components: int = 4,
         covariance: Covariance = "full",
         features: Literal["neural", "fourier"] | Features = "neural",
         in_key: NestedKey = "summary",

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 __all__ = ["PosteriorRefinement"]
 
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -18,9 +19,11 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from ..errors import message
 from ..randomness import seed_from
 from ..sources import Defensive, draw
 from .fit import FitReport, fit
+from .misspecification import doubts
 from .posterior import MixtureDensityPosterior, PhysicsPosterior
 from .priors import BoxPrior, Prior
 from .proposals import focus, importance_weights
@@ -82,10 +85,35 @@ class PosteriorRefinement:
             simulate: Parameters ``(N, D)`` to summaries ``(N, L)``.
             observed: The real summary, shape ``(L,)``.
             key: What this refinement is: same key, same parameters are drawn.
+
+        Raises:
+            ValueError: ``observed`` is not finite; nothing is simulated then.
         """
+        _check_finite(observed)
+        theta = draw(self.proposal(), self.simulations, key=(self.seed, *key, "theta"))
+        return self.learn(theta, simulate(theta), observed, key=key)
+
+    def proposal(self) -> Any:
+        """Return the source that the parameters of the next pairs are to be drawn from."""
+        return self._proposal()[1]
+
+    def learn(
+        self, theta: Tensor, summary: Tensor, observed: Tensor, *, key: tuple[int | str, ...]
+    ) -> FitReport:
+        """Fit and condition once, on pairs that were simulated elsewhere.
+
+        Warns if the real summary lies apart from all simulated ones, or the posterior at an edge:
+        see :mod:`.misspecification`.
+
+        Args:
+            theta: Drawn from the present :meth:`proposal`, shape ``(N, D)``.
+            summary: Simulated at ``theta``, shape ``(N, L)``.
+            observed: The real summary, shape ``(L,)``, or those of n independent trajectories,
+                shape ``(n, L)``.
+            key: What this refinement is.
+        """
+        _check_finite(observed)
         local, proposal = self._proposal()
-        theta = draw(proposal, self.simulations, key=(self.seed, *key, "theta"))
-        summary = simulate(theta)
         pairs = TensorDict({"theta": theta, "summary": summary}, batch_size=[len(theta)])
         if proposal is not local:
             counted = [(proposal, len(theta))]
@@ -97,6 +125,8 @@ class PosteriorRefinement:
             reports.append(fit(network, pairs, **{"seed": seed, **self.fit_options}))
             members.append(network.condition(observed).mixture)
         self.posterior = PhysicsPosterior(_average(members), local)
+        for doubt in doubts(summary, observed, self.posterior):
+            warnings.warn(doubt, stacklevel=2)
         return reports[0]
 
     def _proposal(self) -> tuple[Prior, Any]:
@@ -139,6 +169,19 @@ class PosteriorRefinement:
             diagonal=state["diagonal"],
         )
         self.posterior = PhysicsPosterior(mixture, local)
+
+
+def _check_finite(observed: Tensor) -> None:
+    bad = ~torch.atleast_2d(observed).isfinite()
+    if bad.any():
+        statistics = bad.any(0).nonzero().flatten().tolist()
+        raise ValueError(
+            message(
+                "finite statistics of the real trajectories",
+                f"NaN or infinity in statistics {statistics}",
+                hint="drop the trajectories that diverged, or repair their logs",
+            )
+        )
 
 
 def _average(members: list[TruncatedGaussianMixture]) -> TruncatedGaussianMixture:

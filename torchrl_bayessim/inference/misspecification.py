@@ -1,0 +1,123 @@
+r"""Can the posterior be believed? Two checks on what a refinement has at hand anyway.
+
+A network answers for any summary, also for one unlike all that it was trained on: when the prior
+excludes the robot, or the simulator lacks what the robot does (Cannon et al., 2022,
+arXiv:2209.01845). Two signs of it:
+
+* **The real summary lies apart.** If the model holds, the real summary and the N simulated ones
+  are exchangeable, so the chance that the real one has the largest of the N + 1 distances to its
+  nearest neighbours is at most 1 / (N + 1), whatever the statistics are (a conformal test: Vovk,
+  Gammerman & Shafer, 2005, *Algorithmic Learning in a Random World*).
+* **The posterior piles up** at an edge of the box that was simulated.
+"""
+
+from __future__ import annotations
+
+__all__ = ["doubts", "piled_up", "strangeness"]
+
+import torch
+from torch import Tensor
+
+from ..sources import draw
+from .posterior import PhysicsPosterior
+
+_MOST = 2000  # simulations compared with: the distances between all of them are computed
+_NEIGHBOURS = 5
+_RIM = 0.01  # share of the box's width that counts as its edge
+
+
+def strangeness(summaries: Tensor, observed: Tensor) -> tuple[float, Tensor]:
+    """Return how far ``observed`` lies apart, and in which statistics.
+
+    The distance of a row is its mean distance to its five nearest other rows, all rows (the
+    observed one among them) standardised together. At most 2,000 simulations are looked at.
+
+    Args:
+        summaries: Simulated, shape ``(N, L)``; rows that are not finite are left out.
+        observed: The real one, shape ``(L,)``.
+
+    Returns:
+        The share of the rows, the observed one among them, whose distance is at least that of
+        the observed one: ``1 / (N + 1)`` if it is further out than all simulations. And the
+        deviation of each statistic from the simulated mean in simulated standard deviations,
+        shape ``(L,)``; infinite where a statistic is constant in simulation and differs.
+
+    Example:
+        >>> simulated = torch.randn(99, 3, generator=torch.Generator().manual_seed(0))
+        >>> share, deviation = strangeness(simulated, torch.tensor([0.0, 9.0, 0.0]))
+        >>> share, int(deviation.abs().argmax())
+        (0.01, 1)
+        >>> strangeness(simulated, torch.zeros(3))[0]
+        0.9
+    """
+    simulated = summaries[summaries.isfinite().all(-1)][:_MOST].double()
+    rows = torch.cat([observed[None].double(), simulated])
+    # statistics that are constant up to rounding say nothing
+    least = 1e-6 * rows.abs().amax(0) + 1e-12
+    rows = (rows - rows.mean(0)) / rows.std(0).clamp_min(least)
+    distance = torch.cdist(rows, rows).fill_diagonal_(torch.inf)
+    nearest = distance.topk(min(_NEIGHBOURS, len(simulated)), largest=False).values.mean(-1)
+    share = (nearest >= nearest[0]).double().mean().item()
+    offset = observed - simulated.mean(0)
+    spread = simulated.std(0)
+    apart = offset.abs() > least
+    return share, torch.where(apart, offset / torch.where(spread > least, spread, 0.0), 0.0)
+
+
+def piled_up(posterior: PhysicsPosterior) -> list[tuple[str, str, float]]:
+    """Return ``(name, "lower" or "upper", share)`` where the posterior piles up at an edge.
+
+    That is, where more than half of a parameter's marginal lies within 1 % of the width of the
+    box that was simulated. Nothing for a prior without edges.
+
+    Example:
+        >>> from torchrl_bayessim.inference.priors import BoxPrior
+        >>> from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
+        >>> prior = BoxPrior({"mass": (2.0, 6.0)})
+        >>> beyond = TruncatedGaussianMixture(torch.zeros(1), torch.full((1, 1), 3.0),
+        ...     0.2 * torch.eye(1)[None], prior.box, diagonal=True)
+        >>> [(name, edge) for name, edge, _ in piled_up(PhysicsPosterior(beyond, prior))]
+        [('mass', 'upper')]
+    """
+    prior = posterior.prior
+    if prior.box is None:
+        return []
+    low, high = prior.box
+    z = prior.standardize(draw(posterior, 2048, key=("piled up",)).double())
+    u = (z - low) / (high - low)
+    found = []
+    for edge, distance in {"lower": u, "upper": 1 - u}.items():
+        share = (distance < _RIM).double().mean(0).tolist()
+        found += [(n, edge, s) for n, s in zip(prior.names, share, strict=True) if s > 0.5]
+    return found
+
+
+def doubts(summaries: Tensor, observed: Tensor, posterior: PhysicsPosterior) -> list[str]:
+    """Return one sentence per reason not to believe a posterior; none if all is well.
+
+    Args:
+        summaries: Those that it was fitted to, shape ``(N, L)``.
+        observed: What it was conditioned on, shape ``(L,)`` or ``(n, L)``.
+        posterior: The result.
+    """
+    found = []
+    checks = [strangeness(summaries, row) for row in torch.atleast_2d(observed)]
+    count = int(summaries.isfinite().all(-1).sum())
+    compared = min(count, _MOST)
+    apart = [deviation for share, deviation in checks if share * (compared + 1) < 1.5]
+    if apart:
+        worst = torch.stack(apart).abs().amax(0)
+        order = worst.argsort(descending=True)[:3].tolist()
+        shown = ", ".join(f"number {i} by {worst[i]:.3g}" for i in order)
+        found.append(
+            f"{len(apart)} of {len(checks)} real summaries lie further out than each of {compared} "
+            f"simulated ones. The statistics most off, in simulated standard deviations: {shown}. "
+            "Does the prior hold the real parameters, and the simulator all that the robot does?"
+        )
+    found += [
+        f"{share:.0%} of the posterior of {name!r} lie at the {edge} edge of {posterior.prior!r}. "
+        "Does the prior hold the real value? A wider prior shows it; at an edge that is not the "
+        "prior's own, the next refinement or a larger margin."
+        for name, edge, share in piled_up(posterior)
+    ]
+    return found
