@@ -9,10 +9,11 @@ from __future__ import annotations
 
 __all__ = ["RealSystem", "RecordedLogs", "SurrogateRobot"]
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
@@ -47,6 +48,12 @@ class SurrogateRobot:
         env: With :class:`.transforms.ApplyPhysics`, and no randomizer.
         theta: The hidden parameters, shape ``(D,)``.
         max_steps: Steps after which an episode is cut.
+        measured: Entries of the observation that the robot measures; the policy can read no
+            other, and nothing else is reported.
+
+    Raises:
+        ValueError: For a measured entry that is not observed; in a call, for a policy that reads
+            what is not measured.
 
     Example:
         >>> from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
@@ -61,11 +68,24 @@ class SurrogateRobot:
 
     recorded = False
 
-    def __init__(self, env: EnvBase, theta: Any, *, max_steps: int) -> None:
-        self.max_steps = max_steps
+    def __init__(
+        self,
+        env: EnvBase,
+        theta: Any,
+        *,
+        max_steps: int,
+        measured: Sequence[NestedKey] = ("observation",),
+    ) -> None:
+        self.max_steps, self.measured = max_steps, list(measured)
         theta = torch.as_tensor(theta, dtype=torch.float32)
         self._randomizer = DomainRandomizer(Grid(theta[None]))
         self._env = TransformedEnv(env, self._randomizer, auto_unwrap=False)
+        self._observed = list(self._env.observation_spec.keys(include_nested=True))
+        for entry in self.measured:
+            if entry not in self._observed:
+                raise ValueError(
+                    message("an observation to measure", entry, available=self._observed)
+                )
 
     @torch.no_grad()
     def rollouts(
@@ -76,6 +96,11 @@ class SurrogateRobot:
         key: tuple[int | str, ...],
     ) -> TensorDictBase:
         """Return trajectories ``[episodes, T]`` with a ``"mask"``, made by ``policy``."""
+        for entry in getattr(policy, "in_keys", ()):
+            if entry in self._observed and entry not in self.measured:
+                raise ValueError(
+                    message("a policy that reads what is measured", entry, available=self.measured)
+                )
         width = max(1, self._env.batch_size.numel())
         rows: list[TensorDictBase] = []
         for index in range(-(-episodes // width)):
@@ -84,9 +109,15 @@ class SurrogateRobot:
                 batch = self._env.rollout(
                     self.max_steps, policy, break_when_any_done=False, set_truncated=False
                 )
-            rows.append(batch if batch.ndim == 2 else batch.unsqueeze(0))
+            rows.append(batch.reshape(-1, batch.shape[-1]))
         real = first_trajectories(concatenate(rows)[:episodes])
-        return real.exclude("theta", ("next", "theta"))
+        following = [*self.measured, "reward", "done", "terminated", "truncated"]
+        reported = [*self.measured, "action", "mask", *(_next(entry) for entry in following)]
+        return real.select(*reported, strict=False)
+
+
+def _next(entry: NestedKey) -> NestedKey:
+    return ("next", entry) if isinstance(entry, str) else ("next", *entry)
 
 
 class RecordedLogs:

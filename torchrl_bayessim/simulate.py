@@ -124,7 +124,8 @@ def collect_summaries(
             _check_held(batch.get(randomizer.key, None), rows[done:])
             if index < keep:
                 kept.append(batch.clone())
-            new = prepare(batch)[: len(rows) - done].select(*statistics.in_keys, "mask")
+            new: Any = prepare(batch)[: len(rows) - done]
+            new = new.select(*statistics.in_keys, "mask")
             done, index = done + len(new), index + 1
             ready: Any = concatenate([*waiting, new.clone()])
             whole = len(ready) // trajectories
