@@ -25,7 +25,6 @@ __all__ = [
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -248,11 +247,12 @@ class SummaryStatistics(TensorDictModuleBase):
         mask = trajectories.get("mask")
         # steps that do not count go to the end, as in any padded trajectory
         order = (~mask.flatten(-2)).long().argsort(dim=-1, stable=True)
-        keys = [self.observation_key, self.action_key, _next(self.observation_key), "mask"]
-        flat: Any = trajectories.select(*keys).flatten(-2, -1)
-        index = (*torch.meshgrid(*(torch.arange(n) for n in order.shape[:-1]), indexing="ij"),)
-        rows = tuple(i.unsqueeze(-1) for i in index)
-        return self(flat[(*rows, order)]).get(self.out_keys[0])
+        steps = TensorDict({"mask": mask.flatten(-2).gather(-1, order)}, order.shape)
+        for key in (self.observation_key, self.action_key, _next(self.observation_key)):
+            values = trajectories.get(key).flatten(-3, -2)
+            rows = order.unsqueeze(-1).expand(values.shape)
+            steps.set(key, values.gather(-2, rows))
+        return self(steps).get(self.out_keys[0])
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
