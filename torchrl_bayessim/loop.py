@@ -41,7 +41,7 @@ from .inference.posterior import PhysicsPosterior
 from .inference.refinement import PosteriorRefinement
 from .randomness import isolated, seed_from
 from .robots import RealSystem
-from .simulate import ReplayActions, collect_summaries
+from .simulate import ReplayActions, collect_summaries, make_collector
 from .sources import Defensive
 from .summaries import SummaryStatistics
 from .trajectories import concatenate, first_trajectories
@@ -304,17 +304,8 @@ class SimToRealLoop:
 
     def _collect(self) -> Collector:
         if self._collector is None:
-            self._collector = self._make_collector(self.learner.policy, self.horizon)
+            self._collector = make_collector(self.env, self.learner.policy, steps=self.horizon)
         return self._collector
-
-    def _make_collector(self, policy: TensorDictModuleBase, steps: int) -> Collector:
-        return Collector(
-            self.env,
-            policy,
-            frames_per_batch=self.settings["environments"] * steps,
-            total_frames=-1,
-            auto_register_policy_transforms=False,
-        )
 
     def _simulate(
         self, entry: Mapping[str, Any], theta: Tensor, key: tuple[int | str, ...]
@@ -370,7 +361,7 @@ class SimToRealLoop:
         prepare: Callable[[TensorDictBase], TensorDictBase] = first_trajectories,
     ) -> Tensor:
         """Simulate with a policy that is not the learner's present one."""
-        collector = self._make_collector(policy, steps or self.horizon)
+        collector = make_collector(self.env, policy, steps=steps or self.horizon)
         try:
             summaries, _ = collect_summaries(
                 collector,

@@ -7,7 +7,7 @@ here; for recorded data, :class:`ReplayActions` repeats the recorded actions.
 
 from __future__ import annotations
 
-__all__ = ["ReplayActions", "collect_summaries", "simulate"]
+__all__ = ["ReplayActions", "collect_summaries", "make_collector", "simulate"]
 
 from collections.abc import Callable
 from typing import Any
@@ -69,6 +69,18 @@ class ReplayActions(TensorDictModuleBase):
         rows = torch.arange(step.numel(), device=step.device).reshape(step.shape)
         step = step.clamp(max=self.actions.shape[1] - 1)
         return tensordict.set(self.out_keys[0], self.actions[rows % len(self.actions), step])
+
+
+def make_collector(env: EnvBase, policy: TensorDictModuleBase | None, *, steps: int) -> Collector:
+    """Return a collector of batches of ``steps`` steps of each environment."""
+    with isolated("collector"):  # it tries out the policy
+        return Collector(
+            env,
+            policy,
+            frames_per_batch=max(1, env.batch_size.numel()) * steps,
+            total_frames=-1,
+            auto_register_policy_transforms=False,
+        )
 
 
 def collect_summaries(
@@ -193,13 +205,7 @@ def simulate(
         ...          max_steps=30, progress=False)["summary"].shape
         torch.Size([100, 28])
     """
-    collector = Collector(
-        env,
-        policy,
-        frames_per_batch=max(1, env.batch_size.numel()) * max_steps,
-        total_frames=-1,
-        auto_register_policy_transforms=False,
-    )
+    collector = make_collector(env, policy, steps=max_steps)
     theta = draw(randomizer.source, pairs, key=(seed, "theta"))  # pyright: ignore[reportArgumentType]
     try:
         summaries, _ = collect_summaries(
