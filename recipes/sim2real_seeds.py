@@ -2,8 +2,9 @@
 
     python recipes/sim2real_seeds.py task=cartpole seeds=5 out=recipes/results/sim2real_cartpole
 
-Runs ``sim2real_ppo.py`` once per seed (two at a time), and writes result.json and table.md: nats over
-the prior per parameter and round, and the return at the robot against training under the prior.
+Runs ``sim2real_ppo.py`` once per seed (two at a time), and writes result.json and table.md: nats
+over the prior per parameter and round, and the return at the robot against training under the
+prior.
 """
 
 from __future__ import annotations
