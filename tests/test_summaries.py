@@ -22,7 +22,6 @@ from torchrl_bayessim.summaries import (
     encode_actions,
     linear_dynamics,
     moments,
-    pool_trajectories,
     waypoints,
 )
 from torchrl_bayessim.trajectories import pad
@@ -312,16 +311,6 @@ def test_an_angle_may_be_counted_from_the_last_column():
     assert differences(state, following, [-1])[0].tolist() == pytest.approx([5.0, 0.0832], abs=1e-3)
 
 
-# --- several trajectories of one system
-
-
-def test_pooled_summaries_do_not_depend_on_the_order():
-    summaries = noise(5, 4, 3)
-    torch.testing.assert_close(pool_trajectories(summaries.flip(-2)), pool_trajectories(summaries))
-    assert pool_trajectories(summaries).shape == (5, 6)
-    assert torch.equal(pool_trajectories(summaries[:, :1]), summaries[:, 0])
-
-
 # --- the module, and in a collector
 
 
@@ -376,6 +365,29 @@ def test_angles_are_wrapped_for_every_summary():
     value = SummaryStatistics(moments, autocorrelation(1), angles=[0])(batch)["summary"]
     expected = [0.5, 0.0, math.log(0.25), 1.0]
     assert value.tolist() == pytest.approx(expected, abs=1e-4)
+
+
+ADDITIVE = [cross_correlation, moments, linear_dynamics, duration]
+
+
+@given(lengths=st.lists(st.integers(1, 15), min_size=1, max_size=5), seed=seeds)
+@settings(deadline=None, max_examples=15)
+def test_trajectories_together_count_as_one_of_all_their_steps(lengths, seed):
+    batch = batch_of(lengths, key=seed)
+    each = zip(*(trajectory(steps=t, key=(seed, i)) for i, t in enumerate(lengths)), strict=True)
+    joined = [torch.cat(parts) for parts in each]
+    expected = torch.cat([summary(*joined) for summary in ADDITIVE])
+    together = SummaryStatistics(*ADDITIVE).together
+    torch.testing.assert_close(together(batch), expected, rtol=1e-3, atol=1e-4)
+    backwards = batch[list(range(len(lengths)))[::-1]]
+    torch.testing.assert_close(together(backwards), expected, rtol=1e-3, atol=1e-4)
+
+
+def test_several_systems_are_summarised_at_once():
+    batch = batch_of([5, 9, 2, 7])
+    statistics = SummaryStatistics(*ADDITIVE)
+    both = statistics.together(batch.unflatten(0, (2, 2)))
+    torch.testing.assert_close(both[1], statistics.together(batch[2:]))
 
 
 def test_actions_that_are_indices_are_refused():
