@@ -5,9 +5,9 @@ excludes the robot, or the simulator lacks what the robot does (Cannon et al., 2
 arXiv:2209.01845). Two signs of it:
 
 * **The real summary lies apart.** If the model holds, the real summary and the N simulated ones
-  are exchangeable, so the chance that the real one has the largest of the N + 1 distances to its
-  nearest neighbours is at most 1 / (N + 1), whatever the statistics are (a conformal test: Vovk,
-  Gammerman & Shafer, 2005, *Algorithmic Learning in a Random World*).
+  are exchangeable, so the chance that the real one is among the k of all N + 1 that are furthest
+  from their nearest neighbours is k / (N + 1), whatever the statistics are (a conformal test:
+  Vovk, Gammerman & Shafer, 2005, *Algorithmic Learning in a Random World*).
 * **The posterior piles up** at an edge of the box that was simulated.
 """
 
@@ -21,26 +21,27 @@ from torch import Tensor
 from ..sources import draw
 from .posterior import PhysicsPosterior
 
-_MOST = 2000  # simulations compared with: the distances between all of them are computed
+_MOST = 1000  # simulations compared with: the distances between all of them are computed
 _NEIGHBOURS = 5
+_LEVEL = 0.005  # chance of a false alarm, or 1 / (N + 1) if that is more
 _RIM = 0.01  # share of the box's width that counts as its edge
 
 
 def strangeness(summaries: Tensor, observed: Tensor) -> tuple[float, Tensor]:
     """Return how far ``observed`` lies apart, and in which statistics.
 
-    The distance of a row is its mean distance to its five nearest other rows, all rows (the
-    observed one among them) standardised together. At most 2,000 simulations are looked at.
+    The distance of two rows is the largest difference of their statistics, each in units of its
+    own spread over all rows, the observed one among them; a row lies as far out as its five
+    nearest others are on average. At most 1,000 simulations are looked at.
 
     Args:
         summaries: Simulated, shape ``(N, L)``; rows that are not finite are left out.
         observed: The real one, shape ``(L,)``.
 
     Returns:
-        The share of the rows, the observed one among them, whose distance is at least that of
-        the observed one: ``1 / (N + 1)`` if it is further out than all simulations. And the
-        deviation of each statistic from the simulated mean in simulated standard deviations,
-        shape ``(L,)``; infinite where a statistic is constant in simulation and differs.
+        The share of the rows, the observed one among them, that lie at least as far out:
+        ``1 / (N + 1)`` if the observed one does most. And the deviation of each of its statistics
+        from the median, in units of the spread, shape ``(L,)``.
 
     Example:
         >>> simulated = torch.randn(99, 3, generator=torch.Generator().manual_seed(0))
@@ -48,27 +49,25 @@ def strangeness(summaries: Tensor, observed: Tensor) -> tuple[float, Tensor]:
         >>> share, int(deviation.abs().argmax())
         (0.01, 1)
         >>> strangeness(simulated, torch.zeros(3))[0]
-        0.9
+        0.9...
     """
     simulated = summaries[summaries.isfinite().all(-1)][:_MOST].double()
     rows = torch.cat([observed[None].double(), simulated])
-    # statistics that are constant up to rounding say nothing
-    least = 1e-6 * rows.abs().amax(0) + 1e-12
-    rows = (rows - rows.mean(0)) / rows.std(0).clamp_min(least)
-    distance = torch.cdist(rows, rows).fill_diagonal_(torch.inf)
+    # quartiles, which long tails do not move; where most rows agree, the standard deviation
+    low, median, high = rows.quantile(torch.tensor([0.25, 0.5, 0.75], dtype=rows.dtype), 0)
+    rounding = 1e-6 * rows.abs().amax(0) + 1e-12
+    spread = torch.where(high - low > rounding, (high - low) / 1.35, rows.std(0))
+    rows = (rows - median) / torch.maximum(spread, rounding)
+    distance = torch.cdist(rows, rows, p=torch.inf).fill_diagonal_(torch.inf)
     nearest = distance.topk(min(_NEIGHBOURS, len(simulated)), largest=False).values.mean(-1)
-    share = (nearest >= nearest[0]).double().mean().item()
-    offset = observed - simulated.mean(0)
-    spread = simulated.std(0)
-    apart = offset.abs() > least
-    return share, torch.where(apart, offset / torch.where(spread > least, spread, 0.0), 0.0)
+    return (nearest >= nearest[0]).double().mean().item(), rows[0]
 
 
 def piled_up(posterior: PhysicsPosterior) -> list[tuple[str, str, float]]:
     """Return ``(name, "lower" or "upper", share)`` where the posterior piles up at an edge.
 
-    That is, where more than half of a parameter's marginal lies within 1 % of the width of the
-    box that was simulated. Nothing for a prior without edges.
+    That is, where more than a quarter of a parameter's marginal lies within 1 % of the width of
+    the box that was simulated. Nothing for a prior without edges.
 
     Example:
         >>> from torchrl_bayessim.inference.priors import BoxPrior
@@ -88,7 +87,7 @@ def piled_up(posterior: PhysicsPosterior) -> list[tuple[str, str, float]]:
     found = []
     for edge, distance in {"lower": u, "upper": 1 - u}.items():
         share = (distance < _RIM).double().mean(0).tolist()
-        found += [(n, edge, s) for n, s in zip(prior.names, share, strict=True) if s > 0.5]
+        found += [(n, edge, s) for n, s in zip(prior.names, share, strict=True) if s > 0.25]
     return found
 
 
@@ -102,17 +101,18 @@ def doubts(summaries: Tensor, observed: Tensor, posterior: PhysicsPosterior) -> 
     """
     found = []
     checks = [strangeness(summaries, row) for row in torch.atleast_2d(observed)]
-    count = int(summaries.isfinite().all(-1).sum())
-    compared = min(count, _MOST)
-    apart = [deviation for share, deviation in checks if share * (compared + 1) < 1.5]
+    compared = min(int(summaries.isfinite().all(-1).sum()), _MOST)
+    level = max(_LEVEL, 1.5 / (compared + 1))
+    apart = [deviation for share, deviation in checks if share <= level]
     if apart:
         worst = torch.stack(apart).abs().amax(0)
         order = worst.argsort(descending=True)[:3].tolist()
         shown = ", ".join(f"number {i} by {worst[i]:.3g}" for i in order)
         found.append(
-            f"{len(apart)} of {len(checks)} real summaries lie further out than each of {compared} "
-            f"simulated ones. The statistics most off, in simulated standard deviations: {shown}. "
-            "Does the prior hold the real parameters, and the simulator all that the robot does?"
+            f"{len(apart)} of {len(checks)} real summaries lie as far out as the {level:.1%} of "
+            f"{compared} simulated ones that are furthest from the others. The statistics most "
+            f"off, in units of their spread: {shown}. Does the prior hold the real parameters, and "
+            "the simulator all that the robot does?"
         )
     found += [
         f"{share:.0%} of the posterior of {name!r} lie at the {edge} edge of {posterior.prior!r}. "
