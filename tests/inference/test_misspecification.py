@@ -40,7 +40,7 @@ def redundant(count):
 @pytest.mark.parametrize("kind", [lambda n: torch.randn(n, 30), heavy, edge, redundant])
 def test_a_model_that_holds_is_doubted_as_rarely_as_was_promised(kind):
     """A law of exchangeability, whatever the distribution: once in N + 1 times at most."""
-    trials, count = 400, 39
+    trials, count = 500, 59
     alarms = 0
     for _ in range(trials):
         rows = kind(count + 1)
@@ -94,6 +94,11 @@ def test_simulations_that_diverged_are_not_compared_with():
     assert strangeness(simulated, torch.zeros(3))[0] > 0.1
     (doubt,) = doubts(simulated, torch.full((3,), 20.0), WITHIN)
     assert "of 50 simulated" in doubt
+
+
+def test_too_few_simulations_cannot_tell():
+    assert doubts(torch.randn(49, 3), torch.full((3,), 20.0), WITHIN) == []
+    assert len(doubts(torch.randn(50, 3), torch.full((3,), 20.0), WITHIN)) == 1
 
 
 def test_several_real_trajectories_are_counted():

@@ -24,6 +24,7 @@ from .posterior import PhysicsPosterior
 _MOST = 1000  # simulations compared with: the distances between all of them are computed
 _NEIGHBOURS = 5
 _LEVEL = 0.005  # chance of a false alarm, or 1 / (N + 1) if that is more
+_FEWEST = 50  # simulations, below which a false alarm would be too likely
 _RIM = 0.01  # share of the box's width that counts as its edge
 
 
@@ -94,6 +95,8 @@ def piled_up(posterior: PhysicsPosterior) -> list[tuple[str, str, float]]:
 def doubts(summaries: Tensor, observed: Tensor, posterior: PhysicsPosterior) -> list[str]:
     """Return one sentence per reason not to believe a posterior; none if all is well.
 
+    Fewer than 50 simulations are too few to tell whether the real summary lies apart.
+
     Args:
         summaries: Those that it was fitted to, shape ``(N, L)``.
         observed: What it was conditioned on, shape ``(L,)`` or ``(n, L)``.
@@ -104,7 +107,7 @@ def doubts(summaries: Tensor, observed: Tensor, posterior: PhysicsPosterior) -> 
     compared = min(int(summaries.isfinite().all(-1).sum()), _MOST)
     level = max(_LEVEL, 1.5 / (compared + 1))
     apart = [deviation for share, deviation in checks if share <= level]
-    if apart:
+    if apart and compared >= _FEWEST:
         worst = torch.stack(apart).abs().amax(0)
         order = worst.argsort(descending=True)[:3].tolist()
         shown = ", ".join(f"number {i} by {worst[i]:.3g}" for i in order)
