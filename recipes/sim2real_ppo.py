@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import json
 import math
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +24,12 @@ from tasks import TASKS, Task
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.record.loggers import get_logger
-from tqdm.auto import tqdm
 
 from torchrl_bayessim import plots
 from torchrl_bayessim.agents.ppo import PPO
 from torchrl_bayessim.errors import message
 from torchrl_bayessim.evaluation import evaluate
+from torchrl_bayessim.inference.posterior import PhysicsPosterior
 from torchrl_bayessim.inference.refinement import PosteriorRefinement
 from torchrl_bayessim.loop import Round, SimToRealLoop, ended_return
 from torchrl_bayessim.randomness import isolated
@@ -68,34 +70,42 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
     loop, learner = make_loop(task, truth, settings, out)
     done = Journal(out / "rounds.json", resume=loop.resume() if settings.resume else False)
     print(f"{settings.task}: {task.prior}")
-    for turn in loop:
-        returns = score(learner.policy)
-        done.add(turn.index, describe(turn, task, truth, returns))
-        for entry in turn.curve:
-            for name, value in entry.items():
-                logger.log_scalar(f"train/{name}", value, step=int(entry["frames"]))
-        print(sentence(turn, task, done.rounds[-1]))
-
-    mean, interval = confidence(returns)
-    result: dict[str, Any] = {
-        "task": settings.task,
-        "parameters": list(task.prior.names),
-        "true": truth.tolist(),
-        "rounds": [{k: v for k, v in entry.items() if k != "curve"} for entry in done.rounds],
-        "checkpoint": out / "checkpoint.pt",
-    }
-    curves = {"posterior": [point for entry in done.rounds for point in entry["curve"]]}
-    if settings.baseline:
-        policy, curves["prior"] = train_under_prior(task, settings, frames=turn.frames)
-        baseline = score(policy)
-        mean, interval = confidence(baseline)
-        gain, gain_interval = confidence(returns - baseline)
-        result["baseline"] = {"source": "prior", "real_return": mean, "real_return_ci": interval}
-        result["gain"] = {"real_return": gain, "real_return_ci": gain_interval}
-        print(f"prior only: the robot earns {mean:.1f} {shown(interval)} after as many frames")
-    draw_pictures(out, task, turn, result=result, curves=curves)
+    with Baseline(settings, frames=loop.planned_frames) as baseline:
+        for turn in loop:
+            done.add(turn.index, describe(turn, task, truth, score(learner.policy)))
+            for entry in turn.curve:
+                for name, value in entry.items():
+                    logger.log_scalar(f"train/{name}", value, step=int(entry["frames"]))
+            print(sentence(turn, task, done.rounds[-1]))
+        result: dict[str, Any] = {
+            "task": settings.task,
+            "parameters": list(task.prior.names),
+            "true": truth.tolist(),
+            "rounds": [{k: v for k, v in entry.items() if k != "curve"} for entry in done.rounds],
+            "checkpoint": out / "checkpoint.pt",
+        }
+        curves = {"posterior": [point for entry in done.rounds for point in entry["curve"]]}
+        if settings.baseline:
+            returns = score(learner.policy)
+            weights, curves["prior"] = baseline.result()
+            learner.policy.load_state_dict(weights)
+            result |= compare(returns, score(learner.policy))
+    posterior = loop.refinement.posterior
+    assert posterior is not None  # every round refines it
+    draw_pictures(out, task, posterior, result=result, curves=curves)
     print(f"Pictures and numbers are in {out}")
     return result
+
+
+def compare(returns: Tensor, baseline: Tensor) -> dict[str, Any]:
+    """Return the baseline's entries of result.json; episodes are paired by their initial state."""
+    mean, interval = confidence(baseline)
+    gain, gain_interval = confidence(returns - baseline)
+    print(f"prior only: the robot earns {mean:.1f} {shown(interval)} after as many frames")
+    return {
+        "baseline": {"source": "prior", "real_return": mean, "real_return_ci": interval},
+        "gain": {"real_return": gain, "real_return_ci": gain_interval},
+    }
 
 
 def true_parameters(task: Task, settings: Sim2Real) -> Tensor:
@@ -169,10 +179,31 @@ class Journal:
         recipe.write(self.path, json.dumps(recipe.plain(self.rounds)))
 
 
+class Baseline:
+    """The same PPO under the prior, with as many frames, in a process beside the loop."""
+
+    def __init__(self, settings: Sim2Real, *, frames: int) -> None:
+        self.pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+        if settings.baseline:
+            self.future = self.pool.submit(train_under_prior, settings, frames=frames)
+
+    def __enter__(self) -> Baseline:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.pool.shutdown(cancel_futures=True)
+
+    def result(self) -> tuple[dict[str, Tensor], list[dict[str, float]]]:
+        """Return the policy's weights and the learning curve."""
+        return self.future.result()
+
+
 def train_under_prior(
-    task: Task, settings: Sim2Real, *, frames: int
-) -> tuple[Any, list[dict[str, float]]]:
-    """Return a policy that the same PPO learned under the prior, and its learning curve."""
+    settings: Sim2Real, *, frames: int
+) -> tuple[dict[str, Tensor], list[dict[str, float]]]:
+    """Return the weights of a policy learned under the prior, and its learning curve."""
+    torch.set_num_threads(1)
+    task = TASKS[settings.task]
     env = task.make(task.environments, seed=settings.seed, randomizer=DomainRandomizer(task.prior))
     learner = PPO(env, seed=settings.seed, **task.ppo)
     batch_frames = task.environments * task.horizon
@@ -183,17 +214,16 @@ def train_under_prior(
         total_frames=frames,
         auto_register_policy_transforms=False,
     )
-    batches, curve = iter(collector), []
+    curve: list[dict[str, float]] = []
     updates = math.ceil(frames / batch_frames)
-    bar = tqdm(range(updates), desc="prior only", leave=False, disable=not settings.progress)
-    for update in bar:
+    for update in range(updates):
         with isolated(settings.seed, "prior", update):
-            batch = next(batches)
+            batch: Any = collector.next()
         reported = learner.update(batch, key=("prior", update), progress=update / updates)
         frames_so_far = (update + 1.0) * batch_frames
         curve.append({"frames": frames_so_far, "return": ended_return(batch), **reported})
     collector.shutdown()
-    return learner.policy, curve
+    return dict(learner.policy.state_dict()), curve
 
 
 def describe(turn: Round, task: Task, truth: Tensor, returns: Tensor) -> dict[str, Any]:
@@ -250,13 +280,13 @@ def sentence(turn: Round, task: Task, entry: dict[str, Any]) -> str:
 def draw_pictures(
     out: Path,
     task: Task,
-    turn: Round,
+    posterior: PhysicsPosterior,
     *,
     result: dict[str, Any],
     curves: dict[str, list[dict[str, float]]],
 ) -> None:
     """Write posterior.png (also zoomed), learning.png and return.png."""
-    samples = draw(turn.posterior, 4000, key=("picture",))
+    samples = draw(posterior, 4000, key=("picture",))
     prior_samples = draw(task.prior, 4000, key=("picture", "prior"))
     for name, zoom in {"posterior": False, "posterior_zoom": True}.items():
         figure = plots.pair_plot(

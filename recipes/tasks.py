@@ -50,8 +50,8 @@ class Task:
     max_steps: int
     environments: int = 128
     horizon: int = 128
-    updates: int = 8
-    shared_batches: int = 4
+    updates: int = 6
+    shared_batches: int = 3
     ppo: Mapping[str, Any] = field(default_factory=dict)
     summaries: Sequence[Summary] = (linear_dynamics, duration)
 

@@ -173,6 +173,16 @@ class SimToRealLoop:
         self._state: dict[str, Any] = {"round": 0, "frames": 0, "evidence": []} | _FRESH
         self._collector: Collector | None = None
 
+    @property
+    def planned_frames(self) -> int:
+        """Environment frames that the learner will have seen after all rounds."""
+        rows = self.settings["environments"]
+        shared = 0
+        if not self.robot.recorded:
+            simulated = -(-self.settings["simulations"] * self.episodes // rows)
+            shared = min(self.shared_batches, simulated)
+        return self.rounds * (shared + self.updates) * rows * self.horizon
+
     def __iter__(self) -> Iterator[Round]:
         """Yield the rounds that are left."""
         try:
