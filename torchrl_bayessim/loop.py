@@ -314,7 +314,10 @@ class SimToRealLoop:
 
     def _collect(self) -> Collector:
         if self._collector is None:
+            # a new collector resets the environments: an episode that a resumed run has on top
+            begun = self.randomizer.get_extra_state()
             self._collector = make_collector(self.env, self.learner.policy, steps=self.horizon)
+            self.randomizer.set_extra_state(begun)
         return self._collector
 
     def _simulate(

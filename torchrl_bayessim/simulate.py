@@ -37,7 +37,8 @@ class ReplayActions(TensorDictModuleBase):
         action_key: Entry that is written.
 
     Raises:
-        ValueError: For actions of another shape, or that are not finite.
+        ValueError: For actions of another shape, or that are not finite; in a call, if nothing
+            counts the steps.
 
     Example:
         >>> from tensordict import TensorDict
@@ -65,7 +66,16 @@ class ReplayActions(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action of each environment's current step."""
-        step = tensordict.get(self.in_keys[0]).reshape(tensordict.batch_size)
+        step = tensordict.get(self.in_keys[0], None)
+        if step is None:
+            raise ValueError(
+                message(
+                    f"steps of the episode counted in {self.in_keys[0]!r}",
+                    "no such entry",
+                    hint="a StepCounter among the environment's transforms",
+                )
+            )
+        step = step.reshape(tensordict.batch_size)
         rows = torch.arange(step.numel(), device=step.device).reshape(step.shape)
         step = step.clamp(max=self.actions.shape[1] - 1)
         return tensordict.set(self.out_keys[0], self.actions[rows % len(self.actions), step])

@@ -1,0 +1,649 @@
+import copy
+import functools
+import math
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs import Compose, GymEnv, RewardSum, SerialEnv, StepCounter, TransformedEnv
+
+from torchrl_bayessim import checkpoint
+from torchrl_bayessim.agents.ppo import PPO
+from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
+from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+from torchrl_bayessim.errors import SimulationError
+from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
+from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
+from torchrl_bayessim.inference.refinement import PosteriorRefinement
+from torchrl_bayessim.loop import SimToRealLoop
+from torchrl_bayessim.physics.attributes import AttributePhysics
+from torchrl_bayessim.physics.mujoco import MujocoPhysics
+from torchrl_bayessim.robots import RecordedLogs, SurrogateRobot
+from torchrl_bayessim.simulate import make_collector
+from torchrl_bayessim.sources import Defensive
+from torchrl_bayessim.summaries import SummaryStatistics, duration, moments
+from torchrl_bayessim.trajectories import first_trajectories, pad
+from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
+
+TRUTH = 0.5931
+PRIOR = BoxPrior({"length": (0.2, 1.5)})
+QUICK = {"epochs": 3, "progress": False}
+
+
+def physics():
+    return ApplyPhysics(AttributePhysics("length"))
+
+
+def small(prior, size):
+    return MixtureDensityPosterior(prior, size, components=1)
+
+
+def make_env(width=6, *, prior=PRIOR):
+    randomizer = DomainRandomizer(prior)
+    simulator = CartPoleEnv(width)
+    transforms = Compose(physics(), randomizer, StepCounter(50), RewardSum())
+    return TransformedEnv(simulator, transforms), randomizer
+
+
+def make_robot(episodes=2, horizon=10):
+    env = TransformedEnv(CartPoleEnv(episodes), physics())
+    return SurrogateRobot(env, [TRUTH], max_steps=horizon)
+
+
+def make_loop(env=None, randomizer=None, *, learner=None, robot=None, **options):
+    """Return a loop so small that a round takes a tenth of a second."""
+    if env is None:
+        env, randomizer = make_env()
+    prior = randomizer.source
+    options = {
+        "horizon": 10,
+        "episodes": 2,
+        "updates": 3,
+        "shared_batches": 1,
+        "rounds": 2,
+    } | options
+    fit = {"make_posterior": small, "networks": 1, "fit_options": QUICK}
+    return SimToRealLoop(
+        env,
+        learner or PPO(env, hidden=(4,), minibatch_size=30, epochs=1),
+        robot or make_robot(options["episodes"], options["horizon"]),
+        refinement=PosteriorRefinement(prior, simulations=options.pop("simulations", 24), **fit),
+        statistics=SummaryStatistics(moments, duration),
+        randomizer=randomizer,
+        checkpoint_every=2,
+        progress=False,
+        **options,
+    )
+
+
+def numbers(turn):
+    """Return everything that a round says, but its wall time."""
+    mixture = turn.posterior.mixture
+    return {
+        "index": turn.index,
+        "posterior": [mixture.logits, mixture.loc, mixture.scale_tril],
+        "real": dict(turn.real.flatten_keys(".").items()),
+        "fit": (turn.fit.pairs, turn.fit.dropped, turn.fit.train, turn.fit.validation),
+        "frames": turn.frames,
+        "curve": turn.curve,
+    }
+
+
+def assert_same(one, other):
+    """Exactly: every tensor bit by bit, NaN equal to NaN."""
+    assert type(one) is type(other)
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one:
+            assert_same(one[key], other[key])
+    elif isinstance(one, list | tuple):
+        for a, b in zip(one, other, strict=True):
+            assert_same(a, b)
+    elif isinstance(one, torch.Tensor):
+        torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
+    else:
+        assert one == other or (math.isnan(one) and math.isnan(other))
+
+
+class Recorder(PPO):
+    """A learner that remembers its batches, and its weights before each."""
+
+    def __init__(self, env):
+        super().__init__(env, hidden=(4,), minibatch_size=30, epochs=1)
+        self.batches, self.weights, self.progress = [], [], []
+
+    def update(self, batch, *, key, progress=0.0):
+        self.batches.append(batch.clone())
+        self.weights.append(copy.deepcopy(self.policy.state_dict()))
+        self.progress.append(progress)
+        return super().update(batch, key=key, progress=progress)
+
+
+# One policy per summary, and the same batches for posterior and learner.
+
+
+def test_every_real_summary_is_kept_with_the_policy_that_made_it():
+    env, randomizer = make_env()
+    learner, robot = Recorder(env), make_robot()
+    asked = []
+
+    class Watched(SurrogateRobot):
+        def rollouts(self, policy, **options):
+            asked.append(copy.deepcopy(policy.state_dict()))
+            return robot.rollouts(policy, **options)
+
+    watched = Watched(TransformedEnv(CartPoleEnv(2), physics()), [TRUTH], max_steps=10)
+    loop = make_loop(env, randomizer, learner=learner, robot=watched, rounds=3)
+    turns = list(loop)
+    evidence = loop.state_dict()["loop"]["evidence"]
+    assert len(asked) == len(evidence) == 3
+    for turn, weights, entry in zip(turns, asked, evidence, strict=True):
+        assert_same(dict(weights), entry["policy"])
+        assert torch.equal(entry["summary"], loop.statistics.together(turn.real))
+        # the first update of the round starts from the policy that the robot ran
+        assert_same(dict(weights), dict(learner.weights[4 * turn.index]))
+    changed = [k for k, v in asked[0].items() if not torch.equal(v, asked[1][k])]
+    assert changed
+
+
+def test_each_round_simulates_under_every_policy_that_made_real_data(monkeypatch):
+    """The policies of the collectors that made pairs, against those of the evidence."""
+    used = []
+
+    def watching(env, policy, *, steps):
+        used.append(dict(copy.deepcopy(policy).state_dict()))
+        return make_collector(env, policy, steps=steps)
+
+    monkeypatch.setattr("torchrl_bayessim.loop.make_collector", watching)
+    loop = make_loop(rounds=3, updates=1)
+    sizes = [turn.fit.pairs for turn in loop]
+    policies = [entry["policy"] for entry in loop.state_dict()["loop"]["evidence"]]
+    assert sizes == [24] * 3
+    # round 0: the learner's own; round 1: policy 0 again; round 2: policies 0 and 1 again
+    assert len(used) == 1 + 1 + 2
+    for weights, round_ in zip(used, [0, 0, 0, 1], strict=True):
+        assert_same(weights, policies[round_])
+
+
+def test_a_later_summary_is_another_one_because_the_policy_is():
+    """Mixing them up would not raise, so it must not be possible to overlook."""
+    loop = make_loop(updates=4)
+    list(loop)
+    first, second = loop.state_dict()["loop"]["evidence"]
+    theta = torch.linspace(0.3, 1.2, 8).unsqueeze(-1)
+    under_first = loop._repeat(first, theta, (0,))
+    under_second = loop._repeat(second, theta, (0,))
+    assert torch.equal(under_first, loop._repeat(first, theta, (0,)))
+    assert not torch.allclose(under_first, under_second, rtol=0.05)
+
+
+def test_the_batches_that_made_the_pairs_improve_the_policy_too(monkeypatch):
+    env, randomizer = make_env()
+    learner = Recorder(env)
+    loop = make_loop(env, randomizer, learner=learner, shared_batches=2, rounds=1)
+    pairs = []
+    learn = loop.refinement.learn
+    monkeypatch.setattr(loop.refinement, "learn", lambda *a, **k: pairs.append(a) or learn(*a, **k))
+    (turn,) = loop
+    ((theta, summary, observed),) = pairs
+    shared = learner.batches[0]
+    assert shared.batch_size == (12, 10)  # two batches of six environments: six pairs
+    assert torch.equal(shared["theta"][::2, 0], theta[:6])
+    assert torch.equal(shared["theta"][1::2, 0], theta[:6])
+    rows = loop.statistics(shared)  # a fresh mask: first episodes of each row
+    assert rows.batch_size == (12,)
+    groups = first_trajectories(shared).unflatten(0, (6, 2))
+    torch.testing.assert_close(loop.statistics.together(groups), summary[:6])
+    # real data are not among the pairs, and the true parameters neither
+    assert not (theta == TRUTH).any()
+    assert not torch.isclose(summary, observed).all(-1).any()
+    assert len(learner.batches) == 1 + 3
+    assert turn.frames == sum(batch.numel() for batch in learner.batches) == 12 * 10 + 3 * 60
+    assert [point["frames"] for point in turn.curve] == [120, 180, 240, 300]
+
+
+def test_training_draws_from_the_posterior_mixed_with_the_prior():
+    env, randomizer = make_env(width=200)
+    learner = Recorder(env)
+    loop = make_loop(env, randomizer, learner=learner, rounds=1, updates=1, defensive=0.25)
+    assert randomizer.source is PRIOR
+    (turn,) = loop
+    source = randomizer.source
+    assert isinstance(source, Defensive)
+    assert source.source is turn.posterior
+    assert source.prior is PRIOR
+    assert source.weight == 0.25
+    starts = learner.batches[-1][:, 0]
+    assert (starts["step_count"] == 0).all()
+    assert (source.log_prob(starts["theta"]) > -math.inf).all()
+
+
+def test_progress_of_learning_runs_from_zero_towards_one():
+    env, randomizer = make_env()
+    learner = Recorder(env)
+    list(make_loop(env, randomizer, learner=learner))
+    assert learner.progress == [k / 8 for k in range(8)]
+
+
+# Shapes and simulators.
+
+
+def gym():
+    return TransformedEnv(GymEnv("CartPole-v1"), physics())
+
+
+def simulators(kind):
+    randomizer = DomainRandomizer(PRIOR)
+    after = Compose(randomizer, StepCounter(50), RewardSum())
+    if kind == "single":
+        return TransformedEnv(gym(), after, auto_unwrap=False), randomizer
+    return TransformedEnv(SerialEnv(2, gym), after), randomizer
+
+
+@pytest.mark.parametrize("kind", ["single", "serial"])
+@pytest.mark.parametrize("episodes", [1, 3])
+def test_gymnasium_environments_alone_and_in_a_row(kind, episodes):
+    env, randomizer = simulators(kind)
+    loop = make_loop(env, randomizer, episodes=episodes, simulations=6, updates=1)
+    for turn in loop:
+        assert turn.real.batch_size == (episodes, 10)
+        assert turn.simulations == 6
+        assert turn.posterior.mean.shape == (1,)
+
+
+def test_hopper_with_two_parameters():
+    prior = BoxPrior({"torso": (2.0, 6.0), "damping": (0.5, 2.0)})
+    bodies = {"torso": "body_mass[torso]", "damping": "dof_damping[thigh_joint]"}
+
+    def hopper(width, *more):
+        env = BatchedMujocoEnv("Hopper-v5", width)
+        return TransformedEnv(env, Compose(ApplyPhysics(MujocoPhysics(**bodies)), *more))
+
+    randomizer = DomainRandomizer(prior)
+    env = hopper(4, randomizer, StepCounter(50), RewardSum())
+    robot = SurrogateRobot(hopper(2), [3.7, 1.0], max_steps=10)
+    (turn,) = make_loop(env, randomizer, robot=robot, rounds=1, simulations=12)
+    assert turn.posterior.names == ("torso", "damping")
+    assert prior.contains(turn.posterior.sample((100,))).all()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"episodes": 1},
+        {"updates": 0},
+        {"shared_batches": 0},
+        {"horizon": 2},
+        {"defensive": 0.0},
+        {"simulations": 4},
+    ],
+    ids=str,
+)
+def test_the_smallest_settings_work(options):
+    (turn,) = make_loop(rounds=1, **options)
+    assert turn.posterior.stddev.isfinite().all()
+
+
+def test_one_environment_works():
+    env, randomizer = make_env(1)
+    (turn,) = make_loop(env, randomizer, rounds=1, simulations=5)
+    assert turn.frames == 10 + 3 * 10
+
+
+def test_an_unbounded_prior_works():
+    env, randomizer = make_env(prior=GaussianPrior({"length": (0.8, 0.1)}))
+    turns = list(make_loop(env, randomizer))
+    assert turns[-1].posterior.prior is turns[0].posterior.prior
+
+
+@pytest.mark.parametrize("name", ["horizon", "episodes", "rounds"])
+def test_settings_must_be_positive(name):
+    with pytest.raises(ValueError, match=f"{name} to be positive, got 0"):
+        make_loop(robot=make_robot(), **{name: 0})
+
+
+def test_more_than_ten_rounds():
+    loop = make_loop(rounds=12, updates=1, horizon=4, simulations=12)
+    turns = list(loop)
+    assert [turn.index for turn in turns] == list(range(12))
+    evidence = loop.state_dict()["loop"]["evidence"]
+    for turn, entry in zip(turns, evidence, strict=True):  # in their own order, 10 after 9
+        assert torch.equal(entry["summary"], loop.statistics.together(turn.real))
+    assert len({turn.posterior.mean.item() for turn in turns}) == 12
+
+
+# Real data: what a robot may bring.
+
+
+class Bringing:
+    """A robot that brings what it is told to."""
+
+    recorded = False
+
+    def __init__(self, change):
+        self.robot, self.change = make_robot(), change
+
+    def rollouts(self, policy, **options):
+        return self.change(self.robot.rollouts(policy, **options))
+
+
+def test_a_robot_that_did_fewer_episodes_is_compared_with_as_many():
+    robot = Bringing(lambda real: real[:1])
+    (turn,) = make_loop(robot=robot, rounds=1, shared_batches=9)
+    assert turn.real.batch_size == (1, 10)
+    assert turn.frames == 24 * 10 + 3 * 60  # one episode per pair was simulated
+
+
+def test_longer_real_episodes_are_cut_where_simulated_ones_are():
+    loop = make_loop(robot=make_robot(2, 30), rounds=1)
+    (turn,) = loop
+    assert turn.real.batch_size == (2, 10)
+
+
+def test_real_episodes_that_were_cut_earlier_are_refused():
+    with pytest.raises(ValueError, match=r"last the 10 steps of simulated ones, got 'one cut aft"):
+        list(make_loop(robot=make_robot(2, 6)))
+
+
+def test_real_values_that_are_not_finite_are_refused_before_simulating():
+    def broken(real):
+        real["next", "observation"][1, 3, 2] = torch.nan
+        return real
+
+    env, randomizer = make_env()
+    learner = Recorder(env)
+    loop = make_loop(env, randomizer, learner=learner, robot=Bringing(broken))
+    with pytest.raises(ValueError, match="finite statistics of the real trajectories"):
+        list(loop)
+    assert learner.batches == []
+
+
+# Recorded logs.
+
+
+def logs(lengths=(10, 4, 7)):
+    env = TransformedEnv(CartPoleEnv(len(lengths)), physics())
+    real = SurrogateRobot(env, [TRUTH], max_steps=max(lengths)).rollouts(
+        None, episodes=len(lengths), key=(0,)
+    )
+    return pad([row[:n].exclude("mask") for row, n in zip(real, lengths, strict=True)])
+
+
+def test_logs_are_simulated_by_replaying_their_actions_as_long_as_they_last(monkeypatch):
+    recorded, seen = logs(), []
+    loop = make_loop(robot=RecordedLogs(recorded), rounds=2, updates=1)
+    together = loop.statistics.together
+    monkeypatch.setattr(
+        loop.statistics, "together", lambda rows: seen.append(rows) or together(rows)
+    )
+    turns = list(loop)
+    assert len(loop.state_dict()["loop"]["evidence"]) == 1  # the same logs are not counted twice
+    assert turns[1].real.batch_size == (3, 10)
+    simulated = [rows for rows in seen if rows.ndim == 3]
+    assert sum(len(rows) for rows in simulated) == 2 * 24
+    for rows in simulated:
+        mask = rows["mask"]
+        ended = rows["next", "done"].squeeze(-1)
+        for i in range(3):
+            length = int(recorded["mask"][i].sum())
+            assert not mask[:, i, length:].any()
+            assert (mask[:, i].sum(-1) == length).logical_or((mask & ended)[:, i].any(-1)).all()
+        played = rows["action"][mask]
+        assert torch.equal(played, recorded["action"].expand(len(rows), -1, -1, -1)[mask])
+
+
+def test_environments_must_be_a_multiple_of_the_logs():
+    env, randomizer = make_env(7)
+    loop = make_loop(env, randomizer, robot=RecordedLogs(logs()))
+    with pytest.raises(ValueError, match=r"multiples of the 3 logs.*got 7. Try: 9 environments"):
+        list(loop)
+
+
+def test_logs_whose_replay_nobody_counts_the_steps_of():
+    randomizer = DomainRandomizer(PRIOR)
+    env = TransformedEnv(CartPoleEnv(6), Compose(physics(), randomizer))
+    with pytest.raises(ValueError, match=r"'step_count'.*got 'no such entry'. Try: a StepCounter"):
+        list(make_loop(env, randomizer, robot=RecordedLogs(logs())))
+
+
+# Randomness.
+
+
+def test_same_seed_same_rounds_and_another_seed_others():
+    one, same, other = ([numbers(t) for t in make_loop(seed=seed)] for seed in (0, 0, 1))
+    assert_same(one, same)
+    assert one[0]["curve"][0]["loss_critic"] != other[0]["curve"][0]["loss_critic"]
+    assert not torch.equal(one[0]["posterior"][1], other[0]["posterior"][1])
+
+
+def generators():
+    _, keys, *rest = np.random.get_state()  # noqa: NPY002
+    return torch.random.get_rng_state().tolist(), keys.tolist(), rest, random.getstate()
+
+
+def test_the_global_generators_stay_as_they_were_and_do_not_matter():
+    loop, before = make_loop(), generators()
+    one = []
+    for turn in loop:
+        assert generators() == before
+        one.append(numbers(turn))
+    torch.manual_seed(77)
+    random.seed(77)
+    assert_same(one, [numbers(turn) for turn in make_loop()])
+
+
+# Divergence.
+
+
+def test_simulations_that_diverge_are_counted_and_the_loop_goes_on():
+    loop = make_loop(rounds=1, shared_batches=0)
+    together = loop.statistics.together
+
+    def sometimes(rows):
+        bad = rows["observation"][..., 0, 0, :1] > 0.02  # by chance of the initial state
+        return torch.where(bad, torch.nan, together(rows)) if rows.ndim == 3 else together(rows)
+
+    loop.statistics.together = sometimes
+    with pytest.warns(UserWarning, match="of 24 simulations are not finite: left out"):
+        (turn,) = loop
+    assert 0 < turn.fit.dropped < 24
+    assert turn.simulations == 24 - turn.fit.dropped
+
+
+def test_if_all_simulations_diverge_the_robots_work_is_kept(tmp_path):
+    file = tmp_path / "state.pt"
+    loop = make_loop(checkpoint_file=file)
+    together = loop.statistics.together
+    loop.statistics.together = lambda rows: together(rows) * (1 if rows.ndim == 2 else torch.nan)
+    with pytest.raises(SimulationError, match="24 diverged simulations of 24"):
+        list(loop)
+    again = make_loop(
+        checkpoint_file=file, robot=Bringing(lambda real: pytest.fail("asked the robot again"))
+    )
+    assert again.resume()
+    next(iter(again))
+
+
+# Keeping work.
+
+
+@functools.cache
+def unbroken():
+    """Return the rounds of an unbroken run, and its learner at the end."""
+    loop = make_loop()
+    return [numbers(turn) for turn in loop], loop.learner
+
+
+class BrokenError(RuntimeError):
+    pass
+
+
+def break_after(loop, steps):
+    """Let the loop break before its step number ``steps``, in the middle of the step's work."""
+    count = 0
+    step = loop._step
+
+    def counting(work):
+        nonlocal count
+        count += 1
+        if count <= steps:
+            return step(work)
+        work()  # all of it happens, and is lost
+        raise BrokenError
+
+    loop._step = counting
+    return loop
+
+
+STEPS = 2 * (1 + 1 + 2)  # two rounds of: measure, infer, train two updates, train one
+
+
+@pytest.mark.parametrize("steps", range(STEPS + 1))
+def test_broken_off_at_any_step_it_resumes_to_the_same_numbers(steps, tmp_path):
+    file = tmp_path / "state.pt"
+    turns, learner = unbroken()
+    found = []
+    broken = break_after(make_loop(checkpoint_file=file), steps)
+    try:
+        for turn in broken:
+            found += [numbers(turn)]
+    except BrokenError:
+        assert steps < STEPS
+    resumed = make_loop(checkpoint_file=file)
+    assert resumed.resume() is (steps > 0)
+    found += [numbers(turn) for turn in resumed]
+    assert_same(found, turns)
+    assert_same(resumed.learner.state_dict(), learner.state_dict())
+
+
+@pytest.mark.parametrize("kind", ["single", "serial"])
+def test_gymnasium_environments_resume_to_the_same_numbers(kind, tmp_path):
+    file = tmp_path / "state.pt"
+
+    def gymnasium(**options):
+        return make_loop(*simulators(kind), simulations=4, updates=3, rounds=1, **options)
+
+    (expected,) = gymnasium()
+    with pytest.raises(BrokenError):
+        list(break_after(gymnasium(checkpoint_file=file), 3))  # in its second training step
+    resumed = gymnasium(checkpoint_file=file)
+    assert resumed.resume()
+    (turn,) = resumed
+    assert_same(numbers(turn), numbers(expected))
+
+
+@pytest.mark.parametrize("where", ["robot", "update"])
+def test_an_error_of_robot_or_learner_loses_nothing(where, tmp_path):
+    file = tmp_path / "state.pt"
+    calls = 0
+
+    def third(*_):
+        nonlocal calls
+        calls += 1
+        if calls == (2 if where == "robot" else 6):
+            raise BrokenError
+
+    env, randomizer = make_env()
+
+    class Failing(Recorder):
+        def update(self, *args, **options):
+            third()
+            return super().update(*args, **options)
+
+    learner = Failing(env) if where == "update" else None
+    robot = Bringing(lambda real: third() or real) if where == "robot" else None
+    loop = make_loop(env, randomizer, learner=learner, robot=robot, checkpoint_file=file)
+    with pytest.raises(BrokenError):
+        list(loop)
+    resumed = make_loop(checkpoint_file=file)
+    assert resumed.resume()
+    assert_same([numbers(turn) for turn in resumed], unbroken()[0][1:])
+
+
+def test_a_round_is_told_again_if_the_caller_was_killed_over_it(tmp_path):
+    file = tmp_path / "state.pt"
+    told = numbers(next(iter(make_loop(checkpoint_file=file))))
+    resumed = make_loop(checkpoint_file=file)
+    assert resumed.resume()
+    assert_same([numbers(turn) for turn in resumed], [told, unbroken()[0][1]])
+
+
+def test_a_finished_run_has_no_rounds_left(tmp_path):
+    file = tmp_path / "state.pt"
+    list(make_loop(checkpoint_file=file))
+    resumed = make_loop(checkpoint_file=file)
+    assert resumed.resume()
+    assert list(resumed) == []
+    assert resumed.refinement.posterior is not None
+
+
+def test_without_a_file_there_is_nothing_to_resume(tmp_path):
+    assert not make_loop().resume()
+    assert not make_loop(checkpoint_file=tmp_path / "state.pt").resume()
+
+
+@pytest.mark.parametrize(
+    ("option", "text"),
+    [
+        ({"horizon": 11}, "made with horizon=11, got 10"),
+        ({"episodes": 3}, "made with episodes=3, got 2"),
+        ({"seed": 5}, "made with seed=5, got 0"),
+        ({"simulations": 30}, "made with simulations=30, got 24"),
+        ({"defensive": 0.5}, r"made with defensive=0.5, got 0.1"),
+        ({"env": make_env(7)}, "made with environments=7, got 6"),
+        (
+            {"env": make_env(prior=BoxPrior({"length": (0.2, 1.6)}))},
+            r"made with prior='BoxPrior\(length: \[0.2, 1.6\]\)', got .*\[0.2, 1.5\]",
+        ),
+    ],
+    ids=lambda value: value if isinstance(value, str) else None,
+)
+def test_a_checkpoint_of_other_settings_is_refused(option, text, tmp_path):
+    file = tmp_path / "state.pt"
+    next(iter(make_loop(checkpoint_file=file)))
+    option = dict(option)
+    env = option.pop("env", (None, None))
+    other = make_loop(*env, checkpoint_file=file, **option)
+    with pytest.raises(ValueError, match=f"{text}.*Try: the settings of the run that wrote it"):
+        other.resume()
+
+
+RUN = """
+import sys, warnings
+warnings.simplefilter("ignore")
+import torch
+torch.set_num_threads(1)
+sys.path.insert(0, {folder!r})
+from test_loop import make_loop, numbers
+loop = make_loop(checkpoint_file=sys.argv[1], rounds=50)
+list(loop)
+"""
+
+
+def test_killed_at_any_moment_it_resumes_to_the_same_numbers(tmp_path):
+    file = tmp_path / "state.pt"
+    code = RUN.format(folder=str(Path(__file__).parent))
+    process = subprocess.Popen([sys.executable, "-c", code, str(file)])
+    deadline = time.monotonic() + 120
+    while not file.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    time.sleep(0.5)  # in the first rounds, at whatever it does then
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    resumed, expected = (make_loop(rounds=50, checkpoint_file=f) for f in (file, None))
+    assert resumed.resume()
+    done = checkpoint.load(file)["loop"]["round"]
+    assert done < 40
+    told = dict(zip(range(done + 2), expected, strict=False))
+    for _, turn in zip(range(2), resumed, strict=False):
+        if turn.index in told:
+            assert_same(numbers(turn), numbers(told[turn.index]))
+    assert done in told
+    loop_state = resumed.state_dict()["loop"]
+    assert len(loop_state["evidence"]) == done + 2
