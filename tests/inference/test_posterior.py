@@ -7,6 +7,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_bayessim.inference.features import Features
+from torchrl_bayessim.inference.fit import fit
 from torchrl_bayessim.inference.mixtures import moment_match
 from torchrl_bayessim.inference.posterior import (
     MixtureDensityPosterior,
@@ -321,3 +322,20 @@ def test_an_unknown_pooling_is_refused():
 
 def test_it_shows_its_prior():
     assert "mass: [200, 600]" in repr(posterior())
+
+
+@pytest.mark.parametrize("features", ["fourier", "neural"])
+def test_paper_mode_learns_and_keeps_to_the_support(features):
+    prior = BoxPrior({"a": (0.0, 1.0)})
+    theta = prior.sample((256,), generator=torch.Generator().manual_seed(0))
+    data = TensorDict({"theta": theta, "summary": torch.cat([theta, theta**2], -1)}, [256])
+    posterior = MixtureDensityPosterior.paper_mode(prior, 2, features=features)
+    report = fit(posterior, data, epochs=40, progress=False)
+    assert report.best < -1.0  # the prior's is 0
+    q = posterior.condition(data["summary"][:4], pooling="mean")
+    assert prior.contains(q.sample((100,))).all()
+
+
+def test_paper_mode_knows_its_feature_maps():
+    with pytest.raises(ValueError, match="the name of a feature map"):
+        MixtureDensityPosterior.paper_mode(BoxPrior({"a": (0.0, 1.0)}), 2, features="rff")

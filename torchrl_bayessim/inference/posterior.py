@@ -132,6 +132,7 @@ class MixtureDensityNetwork(nn.Module):
         covariance: ``"diagonal"`` as in the paper, or ``"full"``.
         reach: Means stay within so many prior deviations: inside the box if there is one, because
             the mass of a correlated component far outside cannot be integrated faithfully.
+        compress: Whether heavy tails of the standardised summaries are compressed, by asinh.
     """
 
     shift: Tensor
@@ -145,6 +146,7 @@ class MixtureDensityNetwork(nn.Module):
         components: int,
         covariance: Covariance,
         reach: float,
+        compress: bool = True,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -154,7 +156,7 @@ class MixtureDensityNetwork(nn.Module):
             )
         self.features = features
         self.parameters_, self.components, self.covariance = parameters, components, covariance
-        self.reach = reach
+        self.reach, self.compress = reach, compress
         lower = parameters * (parameters - 1) // 2 if covariance == "full" else 0
         self.sizes = [components, components * parameters, components * parameters]
         self.sizes.append(components * lower)
@@ -178,12 +180,13 @@ class MixtureDensityNetwork(nn.Module):
         self.scale.copy_(torch.where(constant, torch.inf, sd))
 
     def scaled(self, summary: Tensor) -> Tensor:
-        """Return the standardised inputs of the features, with heavy tails compressed."""
+        """Return the standardised inputs of the features."""
         if summary.shape[-1:] != self.shift.shape:
             raise ValueError(
                 message(f"summaries of shape (*, {len(self.shift)})", tuple(summary.shape))
             )
-        return ((summary - self.shift) / self.scale).asinh().to(self.shift.dtype)
+        scaled = (summary - self.shift) / self.scale
+        return (scaled.asinh() if self.compress else scaled).to(self.shift.dtype)
 
     def forward(self, summary: Tensor) -> Mixture:
         """Return the mixture for summaries ``(*, L)``."""
@@ -216,6 +219,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         components: Number K of mixture components.
         covariance: ``"full"``, or ``"diagonal"`` as in the paper.
         features: ``"neural"``, ``"fourier"``, or a ``Features`` module.
+        compress: Whether heavy tails of the summaries are compressed.
         in_key: Key of the summaries, shape ``(*, L)``.
         out_key: Key of the parameters, shape ``(*, D)``.
         seed: Of the initial weights and frequencies.
@@ -240,6 +244,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         components: int = 4,
         covariance: Covariance = "full",
         features: Literal["neural", "fourier"] | Features = "neural",
+        compress: bool = True,
         in_key: NestedKey = "summary",
         out_key: NestedKey = "theta",
         seed: int = 0,
@@ -252,6 +257,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
             components=components,
             covariance=covariance,
             reach=8.0 if prior.box is None else prior.box[1].max().item(),
+            compress=compress,
             seed=seed,
         )
         keys: dict[str, NestedKey] = {name: ("posterior", name) for name in Mixture._fields}
@@ -270,6 +276,45 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         ]
         super().__init__(*modules)  # pyright: ignore[reportCallIssue, reportArgumentType]
         self.prior = prior
+
+    @classmethod
+    def paper_mode(
+        cls,
+        prior: Prior,
+        summary_dim: int,
+        *,
+        features: Literal["fourier", "neural"] = "fourier",
+        seed: int = 0,
+    ) -> MixtureDensityPosterior:
+        """Return a posterior with the BayesSim paper's choices (arXiv:1906.01728, sec. III and V).
+
+        Diagonal components, variances by the modified ELU, RBF features of plainly standardised
+        summaries (length scale by :func:`.fit.select_lengthscale`) or two layers of 24 units. The
+        paper does not say how many components and frequencies: 10 and 500, as in its code. The
+        support is truncated all the same. Use it with ``cross_correlation`` and
+        ``condition(..., pooling="mean")``.
+
+        Example:
+            >>> from torchrl_bayessim.inference.priors import BoxPrior
+            >>> posterior = MixtureDensityPosterior.paper_mode(BoxPrior({"dt": (0.01, 0.3)}), 7)
+            >>> posterior.network.components, posterior.network.covariance
+            (10, 'diagonal')
+        """
+        maps = {
+            "fourier": lambda: FourierFeatures(summary_dim, frequencies=500, seed=seed),
+            "neural": lambda: NeuralFeatures(summary_dim, widths=(24, 24), seed=seed),
+        }
+        if features not in maps:
+            raise ValueError(message("the name of a feature map", features, available=maps))
+        return cls(
+            prior,
+            summary_dim,
+            components=10,
+            covariance="diagonal",
+            features=maps[features](),
+            compress=False,
+            seed=seed,
+        )
 
     @property
     def network(self) -> MixtureDensityNetwork:

@@ -1,0 +1,100 @@
+"""What does domain randomisation cost on Hopper?
+
+Frames per second of a collector with the two transforms (a mass and two frictions drawn, written,
+read back at every reset), over the same collector without them, with episodes of 100 steps:
+``GymEnv``, ``SerialEnv`` of four, and ``BatchedMujocoEnv`` of 64. Prints one JSON line per case::
+
+    python recipes/benchmarks/reset_overhead.py [runs=7] [steps=100] [seconds=2]
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import partial
+
+import torch
+from measuring import compare, options, report
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymEnv, SerialEnv, StepCounter
+from torchrl.envs import TransformedEnv
+
+from torchrl_bayessim import ApplyPhysics, BoxPrior, DomainRandomizer, MujocoPhysics
+from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+from torchrl_bayessim.envs.task import Task
+
+PRIOR = BoxPrior({"mass": (2.0, 6.0), "friction": (0.4, 2.0)})
+
+
+def apply() -> ApplyPhysics:
+    """Return the transform beside the simulator."""
+    return ApplyPhysics(
+        MujocoPhysics(
+            mass="body_mass[torso]",
+            friction=("geom_friction[floor,0]", "geom_friction[foot_geom,0]"),
+        )
+    )
+
+
+def hopper() -> EnvBase:
+    """Return a Hopper that does not fall, so that every episode has the same length."""
+    return GymEnv("Hopper-v5", terminate_when_unhealthy=False)
+
+
+def single(*, randomized: bool, steps: int) -> EnvBase:
+    """Return one environment."""
+    extra = [apply(), DomainRandomizer(PRIOR)] if randomized else []
+    return TransformedEnv(hopper(), Compose(*extra, StepCounter(steps), DoubleToFloat()))
+
+
+def serial(*, randomized: bool, steps: int) -> EnvBase:
+    """Return four environments, with the randomizer outside."""
+    make = (lambda: TransformedEnv(hopper(), apply())) if randomized else hopper
+    extra = [DomainRandomizer(PRIOR)] if randomized else []
+    return TransformedEnv(SerialEnv(4, make), Compose(*extra, StepCounter(steps), DoubleToFloat()))
+
+
+def batched(*, randomized: bool, steps: int) -> EnvBase:
+    """Return 64 environments that step in one native call."""
+    env = BatchedMujocoEnv(_standing(), 64, threads=1)
+    extra = [apply(), DomainRandomizer(PRIOR)] if randomized else []
+    return TransformedEnv(env, Compose(*extra, StepCounter(steps)))
+
+
+def _standing() -> Task:
+    from dataclasses import replace
+
+    from torchrl_bayessim.envs.tasks.catalogue import known_task
+
+    return replace(known_task("Hopper-v5"), termination=None)
+
+
+def collect(collector: Collector, frames: int) -> int:
+    """Collect at least ``frames`` frames."""
+    count = 0
+    while count < frames:
+        count += collector.next().numel()
+    return count
+
+
+def main(*arguments: str) -> None:
+    """Measure the three kinds of environment, with and without randomisation."""
+    given = options(list(arguments), runs=7, steps=100, frames=4000)
+    torch.set_num_threads(1)
+    for name, make in {"GymEnv": single, "SerialEnv": serial, "BatchedMujocoEnv": batched}.items():
+        cases: dict[str, Callable[[], int]] = {}
+        for label in ("plain", "randomized"):
+            env = make(randomized=label == "randomized", steps=given["steps"])
+            rows = max(1, env.batch_size.numel())
+            collector = Collector(env, frames_per_batch=rows * 200, total_frames=-1)
+            frames = given["frames"] * (5 if rows == 64 else 1)
+            cases[label] = partial(collect, collector, frames)
+        rates = compare(cases, runs=given["runs"])
+        report("reset_overhead", f"{name} plain", rates["plain"], steps=given["steps"])
+        against = {"plain": rates["plain"]}
+        report("reset_overhead", f"{name} randomized", rates["randomized"], against=against,
+               steps=given["steps"])
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
