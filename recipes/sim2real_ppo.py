@@ -29,7 +29,7 @@ from torchrl_bayessim import plots
 from torchrl_bayessim.agents.ppo import PPO
 from torchrl_bayessim.errors import message
 from torchrl_bayessim.evaluation import evaluate
-from torchrl_bayessim.inference.posterior import PhysicsPosterior
+from torchrl_bayessim.inference.physics_posterior import PhysicsPosterior
 from torchrl_bayessim.inference.refinement import PosteriorRefinement
 from torchrl_bayessim.loop import Round, SimToRealLoop, ended_return
 from torchrl_bayessim.randomness import isolated

@@ -37,7 +37,7 @@ from tqdm.auto import tqdm
 from . import checkpoint
 from .errors import message
 from .inference.fit import FitReport
-from .inference.posterior import PhysicsPosterior
+from .inference.physics_posterior import PhysicsPosterior
 from .inference.refinement import PosteriorRefinement
 from .randomness import isolated, seed_from
 from .robots import RealSystem

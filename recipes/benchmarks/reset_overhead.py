@@ -16,8 +16,15 @@ from functools import partial
 import torch
 from measuring import compare, options, report
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymEnv, SerialEnv, StepCounter
-from torchrl.envs import TransformedEnv
+from torchrl.envs import (
+    Compose,
+    DoubleToFloat,
+    EnvBase,
+    GymEnv,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
 
 from torchrl_bayessim import ApplyPhysics, BoxPrior, DomainRandomizer, MujocoPhysics
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
@@ -92,8 +99,13 @@ def main(*arguments: str) -> None:
         rates = compare(cases, runs=given["runs"])
         report("reset_overhead", f"{name} plain", rates["plain"], steps=given["steps"])
         against = {"plain": rates["plain"]}
-        report("reset_overhead", f"{name} randomized", rates["randomized"], against=against,
-               steps=given["steps"])
+        report(
+            "reset_overhead",
+            f"{name} randomized",
+            rates["randomized"],
+            against=against,
+            steps=given["steps"],
+        )
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchrl_bayessim.inference.misspecification import doubts, piled_up, strangeness
-from torchrl_bayessim.inference.posterior import PhysicsPosterior
+from torchrl_bayessim.inference.physics_posterior import PhysicsPosterior
 from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
 from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
 

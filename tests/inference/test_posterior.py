@@ -9,11 +9,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_bayessim.inference.features import Features
 from torchrl_bayessim.inference.fit import fit
 from torchrl_bayessim.inference.mixtures import moment_match
-from torchrl_bayessim.inference.posterior import (
-    MixtureDensityPosterior,
-    PhysicsPosterior,
-    melu,
-)
+from torchrl_bayessim.inference.network import melu
+from torchrl_bayessim.inference.physics_posterior import PhysicsPosterior
+from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
 from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
 from torchrl_bayessim.randomness import generator

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_bayessim.errors import SimulationError
-from torchrl_bayessim.inference.posterior import PhysicsPosterior
+from torchrl_bayessim.inference.physics_posterior import PhysicsPosterior
 from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
 from torchrl_bayessim.inference.proposals import (
     HighestDensityPrior,

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ..sources import draw
-from .posterior import PhysicsPosterior
+from .physics_posterior import PhysicsPosterior
 
 _MOST = 1000  # simulations compared with: the distances between all of them are computed
 _NEIGHBOURS = 5

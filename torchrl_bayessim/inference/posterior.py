@@ -13,11 +13,10 @@ simulators", arXiv:1906.01728, eq. 9-13). Nothing leaks outside the box and noth
 
 from __future__ import annotations
 
-__all__ = ["MixtureDensityNetwork", "MixtureDensityPosterior", "PhysicsPosterior", "melu"]
+__all__ = ["MixtureDensityPosterior"]
 
-from collections.abc import Sequence
 from functools import partial
-from typing import ClassVar, Literal
+from typing import Literal
 
 import torch
 from tensordict import NestedKey
@@ -26,184 +25,20 @@ from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
 )
-from torch import Tensor, nn
-from torch.distributions import Distribution
+from torch import Tensor
 
 from ..errors import message
 from .features import Features, FourierFeatures, NeuralFeatures
 from .mixtures import Mixture
+from .network import Covariance, MixtureDensityNetwork
+from .physics_posterior import PhysicsPosterior
 from .pooling import pool
 from .priors import Prior
 from .truncation import POINTS, TruncatedGaussianMixture
 
-Covariance = Literal["diagonal", "full"]
 Pooling = Literal["product", "mean"]
 MAPS = {"neural": NeuralFeatures, "fourier": FourierFeatures}
-WIDEST = 4.0  # of a component, in prior deviations: nearly flat over a box, which spans 3.5
-STEEPEST = 100.0  # ratio of a marginal to a conditional deviation
 TRAINING_POINTS = 16  # for the mass of correlated components while the loss is minimised
-FLOOR = 1e-8  # of a variance, in standardised coordinates: a deviation of 1e-4 prior deviations
-
-
-def melu(z: Tensor) -> Tensor:
-    r"""The paper's modified ELU, :math:`e^z` for :math:`z < 0` and :math:`z + 1` above: a variance.
-
-    The paper's constant alpha must be 1: smaller leaves a floor of 1 - alpha, larger allows
-    negative variances. Computed without the cancellation of ``elu(z) + 1``, which is exactly 0 in
-    float32 below z = -16.
-
-    Example:
-        >>> melu(torch.tensor([-40.0, 0.0, 2.0])) > 0
-        tensor([True, True, True])
-    """
-    return torch.where(z < 0, z.clamp(max=0.0).exp(), z + 1) + FLOOR
-
-
-class PhysicsPosterior(Distribution):
-    """A distribution over physics parameters: a truncated mixture seen through the prior's scaling.
-
-    Args:
-        mixture: In standardised coordinates, batch shape ``(*)``.
-        prior: Whose coordinates, names, units and support are used.
-
-    Example:
-        >>> from torchrl_bayessim.inference.priors import BoxPrior
-        >>> prior = BoxPrior({"mass": (2.0, 6.0)})
-        >>> q = PhysicsPosterior(TruncatedGaussianMixture(torch.zeros(1), torch.zeros(1, 1),
-        ...     0.1 * torch.eye(1)[None], prior.box, diagonal=True), prior)
-        >>> q.names, round(q.mean.item(), 3), round(q.stddev.item(), 3)
-        (('mass',), 4.0, 0.115)
-    """
-
-    arg_constraints: ClassVar[dict] = {}
-    has_rsample = False
-
-    def __init__(self, mixture: TruncatedGaussianMixture, prior: Prior) -> None:
-        self.mixture, self.prior = mixture, prior
-        self.names, self.units = prior.names, prior.units
-        super().__init__(mixture.batch_shape, mixture.event_shape, validate_args=False)
-
-    @property
-    def support(self) -> torch.distributions.constraints.Constraint:  # noqa: D102
-        return self.prior.support  # pyright: ignore[reportReturnType]
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        """Return the log-density in the parameters' own units, shape ``(*)``."""
-        z = self.prior.standardize(value.double())
-        volume = self.prior.standardization.log_abs_det_jacobian(z, value.double())
-        return (self.mixture.log_prob(z) - volume).to(torch.get_default_dtype())
-
-    def sample(
-        self, sample_shape: Sequence[int] = (), *, generator: torch.Generator | None = None
-    ) -> Tensor:
-        """Return draws of shape ``(*sample_shape, *, D)``, from ``generator`` if one is given."""
-        z = self.mixture.sample(sample_shape, generator=generator)
-        return self.prior.unstandardize(z).to(torch.get_default_dtype())
-
-    def _expectation(self, power: int) -> Tensor:
-        points, weight = self.mixture.quadrature()
-        theta = self.prior.unstandardize(points)
-        return (weight.unsqueeze(-1) * theta**power).sum(0)
-
-    @property
-    def mean(self) -> Tensor:
-        """The posterior means, shape ``(*, D)``, by a fixed quadrature."""
-        return self._expectation(1).to(torch.get_default_dtype())
-
-    @property
-    def variance(self) -> Tensor:
-        """The posterior variances, shape ``(*, D)``, by a fixed quadrature."""
-        spread = self._expectation(2) - self._expectation(1) ** 2
-        return spread.clamp_min(0).to(torch.get_default_dtype())
-
-    @property
-    def deterministic_sample(self) -> Tensor:
-        """The mean, which TensorDict modules return under ``ExplorationType.DETERMINISTIC``."""
-        return self.mean
-
-
-class MixtureDensityNetwork(nn.Module):
-    """Summary statistics to mixture parameters in standardised coordinates.
-
-    Args:
-        features: Of the summaries.
-        parameters: Number D of physics parameters.
-        components: Number K of mixture components.
-        covariance: ``"diagonal"`` as in the paper, or ``"full"``.
-        reach: Means stay within so many prior deviations: inside the box if there is one, because
-            the mass of a correlated component far outside cannot be integrated faithfully.
-        compress: Whether heavy tails of the standardised summaries are compressed, by asinh.
-    """
-
-    shift: Tensor
-    scale: Tensor
-
-    def __init__(
-        self,
-        features: Features,
-        parameters: int,
-        *,
-        components: int,
-        covariance: Covariance,
-        reach: float,
-        compress: bool = True,
-        seed: int = 0,
-    ) -> None:
-        super().__init__()
-        if covariance not in {"diagonal", "full"}:
-            raise ValueError(
-                message("a covariance structure", covariance, available=["diagonal", "full"])
-            )
-        self.features = features
-        self.parameters_, self.components, self.covariance = parameters, components, covariance
-        self.reach, self.compress = reach, compress
-        lower = parameters * (parameters - 1) // 2 if covariance == "full" else 0
-        self.sizes = [components, components * parameters, components * parameters]
-        self.sizes.append(components * lower)
-        with torch.random.fork_rng(devices=[]):
-            torch.random.default_generator.manual_seed(seed)
-            self.head = nn.Linear(features.out_features, sum(self.sizes))
-        start = torch.quasirandom.SobolEngine(parameters, scramble=True, seed=seed)
-        with torch.no_grad():
-            self.head.weight.mul_(0.1)
-            self.head.bias.zero_()
-            loc = self.head.bias.split(self.sizes)[1]
-            loc.copy_((1.2 * (2 * start.draw(components) - 1)).flatten())
-        self.register_buffer("shift", torch.zeros(features.dim))
-        self.register_buffer("scale", torch.ones(features.dim))
-
-    def standardize_inputs(self, summaries: Tensor) -> None:
-        """Set the input scaling from training summaries ``(N, L)``; constant ones are ignored."""
-        mean, sd = summaries.mean(0), summaries.std(0)
-        constant = sd <= 1e-6 * (1e-12 + summaries.abs().amax(0))
-        self.shift.copy_(mean)
-        self.scale.copy_(torch.where(constant, torch.inf, sd))
-
-    def scaled(self, summary: Tensor) -> Tensor:
-        """Return the standardised inputs of the features."""
-        if summary.shape[-1:] != self.shift.shape:
-            raise ValueError(
-                message(f"summaries of shape (*, {len(self.shift)})", tuple(summary.shape))
-            )
-        scaled = (summary - self.shift) / self.scale
-        return (scaled.asinh() if self.compress else scaled).to(self.shift.dtype)
-
-    def forward(self, summary: Tensor) -> Mixture:
-        """Return the mixture for summaries ``(*, L)``."""
-        raw = self.head(self.features(self.scaled(summary)))
-        logits, loc, diagonal, lower = raw.split(self.sizes, -1)
-        shape = (*summary.shape[:-1], self.components, self.parameters_)
-        loc = self.reach * torch.tanh(loc.reshape(shape) / self.reach)
-        deviation = melu(diagonal.reshape(shape)).sqrt()
-        deviation = WIDEST * torch.tanh(deviation / WIDEST)
-        rows = torch.diag_embed(torch.ones_like(deviation))
-        if self.covariance == "full" and self.parameters_ > 1:
-            below = torch.tril_indices(self.parameters_, self.parameters_, -1)
-            slope = lower.reshape(*shape[:-1], -1)
-            rows[..., below[0], below[1]] = STEEPEST * torch.tanh(slope / STEEPEST)
-            # unit rows: the network sets marginal deviations and correlations separately
-            rows = rows / rows.norm(dim=-1, keepdim=True)
-        return Mixture(logits, loc, deviation.unsqueeze(-1) * rows)
 
 
 class MixtureDensityPosterior(ProbabilisticTensorDictSequential):

@@ -34,7 +34,7 @@ from torch import Tensor
 from ..errors import SimulationError, message
 from ..sources import draw
 from .mixtures import Mixture, divide, multiply
-from .posterior import PhysicsPosterior
+from .physics_posterior import PhysicsPosterior
 from .priors import BoxPrior, Prior
 from .truncation import TruncatedGaussianMixture
 

@@ -24,7 +24,8 @@ from ..randomness import seed_from
 from ..sources import Defensive, draw
 from .fit import FitReport, fit
 from .misspecification import doubts
-from .posterior import MixtureDensityPosterior, PhysicsPosterior
+from .physics_posterior import PhysicsPosterior
+from .posterior import MixtureDensityPosterior
 from .priors import BoxPrior, Prior
 from .proposals import focus, importance_weights
 from .truncation import TruncatedGaussianMixture

@@ -19,7 +19,8 @@ from torch import Tensor
 from ..errors import message
 from ..sources import Defensive, draw
 from .fit import FitReport, fit
-from .posterior import MixtureDensityPosterior, PhysicsPosterior
+from .physics_posterior import PhysicsPosterior
+from .posterior import MixtureDensityPosterior
 from .priors import Prior
 from .proposals import (
     HighestDensityPrior,

@@ -1,0 +1,117 @@
+"""The mixture density network: summary statistics to the parameters of a Gaussian mixture."""
+
+from __future__ import annotations
+
+__all__ = ["Covariance", "MixtureDensityNetwork", "melu"]
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from ..errors import message
+from .features import Features
+from .mixtures import Mixture
+
+Covariance = Literal["diagonal", "full"]
+WIDEST = 4.0  # of a component, in prior deviations: nearly flat over a box, which spans 3.5
+STEEPEST = 100.0  # ratio of a marginal to a conditional deviation
+FLOOR = 1e-8  # of a variance, in standardised coordinates: a deviation of 1e-4 prior deviations
+
+
+def melu(z: Tensor) -> Tensor:
+    r"""The paper's modified ELU, :math:`e^z` for :math:`z < 0` and :math:`z + 1` above: a variance.
+
+    The paper's constant alpha must be 1: smaller leaves a floor of 1 - alpha, larger allows
+    negative variances. Computed without the cancellation of ``elu(z) + 1``, which is exactly 0 in
+    float32 below z = -16.
+
+    Example:
+        >>> melu(torch.tensor([-40.0, 0.0, 2.0])) > 0
+        tensor([True, True, True])
+    """
+    return torch.where(z < 0, z.clamp(max=0.0).exp(), z + 1) + FLOOR
+
+
+class MixtureDensityNetwork(nn.Module):
+    """Summary statistics to mixture parameters in standardised coordinates.
+
+    Args:
+        features: Of the summaries.
+        parameters: Number D of physics parameters.
+        components: Number K of mixture components.
+        covariance: ``"diagonal"`` as in the paper, or ``"full"``.
+        reach: Means stay within so many prior deviations: inside the box if there is one, because
+            the mass of a correlated component far outside cannot be integrated faithfully.
+        compress: Whether heavy tails of the standardised summaries are compressed, by asinh.
+    """
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(
+        self,
+        features: Features,
+        parameters: int,
+        *,
+        components: int,
+        covariance: Covariance,
+        reach: float,
+        compress: bool = True,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        if covariance not in {"diagonal", "full"}:
+            raise ValueError(
+                message("a covariance structure", covariance, available=["diagonal", "full"])
+            )
+        self.features = features
+        self.parameters_, self.components, self.covariance = parameters, components, covariance
+        self.reach, self.compress = reach, compress
+        lower = parameters * (parameters - 1) // 2 if covariance == "full" else 0
+        self.sizes = [components, components * parameters, components * parameters]
+        self.sizes.append(components * lower)
+        with torch.random.fork_rng(devices=[]):
+            torch.random.default_generator.manual_seed(seed)
+            self.head = nn.Linear(features.out_features, sum(self.sizes))
+        start = torch.quasirandom.SobolEngine(parameters, scramble=True, seed=seed)
+        with torch.no_grad():
+            self.head.weight.mul_(0.1)
+            self.head.bias.zero_()
+            loc = self.head.bias.split(self.sizes)[1]
+            loc.copy_((1.2 * (2 * start.draw(components) - 1)).flatten())
+        self.register_buffer("shift", torch.zeros(features.dim))
+        self.register_buffer("scale", torch.ones(features.dim))
+
+    def standardize_inputs(self, summaries: Tensor) -> None:
+        """Set the input scaling from training summaries ``(N, L)``; constant ones are ignored."""
+        mean, sd = summaries.mean(0), summaries.std(0)
+        constant = sd <= 1e-6 * (1e-12 + summaries.abs().amax(0))
+        self.shift.copy_(mean)
+        self.scale.copy_(torch.where(constant, torch.inf, sd))
+
+    def scaled(self, summary: Tensor) -> Tensor:
+        """Return the standardised inputs of the features."""
+        if summary.shape[-1:] != self.shift.shape:
+            raise ValueError(
+                message(f"summaries of shape (*, {len(self.shift)})", tuple(summary.shape))
+            )
+        scaled = (summary - self.shift) / self.scale
+        return (scaled.asinh() if self.compress else scaled).to(self.shift.dtype)
+
+    def forward(self, summary: Tensor) -> Mixture:
+        """Return the mixture for summaries ``(*, L)``."""
+        raw = self.head(self.features(self.scaled(summary)))
+        logits, loc, diagonal, lower = raw.split(self.sizes, -1)
+        shape = (*summary.shape[:-1], self.components, self.parameters_)
+        loc = self.reach * torch.tanh(loc.reshape(shape) / self.reach)
+        deviation = melu(diagonal.reshape(shape)).sqrt()
+        deviation = WIDEST * torch.tanh(deviation / WIDEST)
+        rows = torch.diag_embed(torch.ones_like(deviation))
+        if self.covariance == "full" and self.parameters_ > 1:
+            below = torch.tril_indices(self.parameters_, self.parameters_, -1)
+            slope = lower.reshape(*shape[:-1], -1)
+            rows[..., below[0], below[1]] = STEEPEST * torch.tanh(slope / STEEPEST)
+            # unit rows: the network sets marginal deviations and correlations separately
+            rows = rows / rows.norm(dim=-1, keepdim=True)
+        return Mixture(logits, loc, deviation.unsqueeze(-1) * rows)
