@@ -27,6 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl_bayessim.errors import BayesSimError, message
 
 PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "torchrl_bayessim")
+FREE = ("progress", "debug", "logger")  # settings that a resumed run may change
 
 
 @dataclasses.dataclass
@@ -49,14 +50,11 @@ def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> No
     debug = "debug=true" in sys.argv[1:]
     try:
         settings = parse(settings_type, sys.argv[1:])
-        folder = Path(
-            settings.out
-            or getattr(settings, "resume", "")
-            or f"outputs/{name}/{datetime.now():%Y-%m-%d_%H-%M-%S}"
-        )
+        folder = Path(settings.out or f"outputs/{name}/{datetime.now():%Y-%m-%d_%H-%M-%S}")
         folder.mkdir(parents=True, exist_ok=True)
+        write(folder / "settings.json", json.dumps(dataclasses.asdict(settings)) + "\n")
         result = job(settings, folder)
-    except (ValueError, TypeError, KeyError, OSError, BayesSimError) as error:
+    except (ValueError, TypeError, KeyError, OSError, ImportError, BayesSimError) as error:
         if debug:
             raise
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
@@ -69,10 +67,11 @@ def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> No
 
 
 def parse(settings_type: type[S], arguments: list[str]) -> S:
-    """Return settings from ``key=value`` arguments.
+    """Return settings from ``key=value`` arguments; ``resume=FOLDER`` brings those of that run.
 
     Raises:
-        ValueError: For an unknown key, a value of the wrong type, or an argument without ``=``.
+        ValueError: For an unknown key, a value of the wrong type, an argument without ``=``, a
+            folder without a run to resume, or a setting that differs from that run's.
     """
     fields = [field.name for field in dataclasses.fields(settings_type)]
     for argument in arguments:
@@ -82,11 +81,29 @@ def parse(settings_type: type[S], arguments: list[str]) -> S:
         if key not in fields:
             raise ValueError(message("the name of a setting", key, available=fields))
     try:
-        merged = OmegaConf.merge(OmegaConf.structured(settings_type), OmegaConf.from_cli(arguments))
-        return OmegaConf.to_object(merged)  # pyright: ignore[reportReturnType]
+        given = OmegaConf.merge(OmegaConf.structured(settings_type), OmegaConf.from_cli(arguments))
+        settings: Any = OmegaConf.to_object(given)
     except OmegaConfBaseException as error:
         reason = str(error).splitlines()[0]
         raise ValueError(message("values of the settings' types", reason)) from None
+    keys = [argument.partition("=")[0] for argument in arguments]
+    return resumed(settings, keys) if getattr(settings, "resume", "") else settings
+
+
+def resumed(settings: S, given: list[str]) -> S:
+    """Return the settings of the run to resume, and ``given`` ones where they may differ."""
+    folder: str = settings.resume  # pyright: ignore[reportAttributeAccessIssue]
+    path = Path(folder, "settings.json")
+    if not path.exists():
+        raise ValueError(message("the folder of a run to resume", folder, hint="the out= of a run"))
+    earlier = json.loads(path.read_text()) | {"resume": folder, "out": folder}
+    for key in given:
+        value = getattr(settings, key)
+        if key in FREE:
+            earlier[key] = value
+        elif value != earlier[key]:
+            raise ValueError(message(f"{key}={earlier[key]}, as in the run to resume", value))
+    return dataclasses.replace(settings, **earlier)
 
 
 def provenance(settings: Settings, *, seconds: float) -> dict[str, Any]:

@@ -10,11 +10,14 @@ pictures, learning curves and a checkpoint; ``resume=FOLDER`` goes on after a br
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
+import os
+import threading
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +40,8 @@ from torchrl_bayessim.robots import SurrogateRobot
 from torchrl_bayessim.sources import Grid, draw
 from torchrl_bayessim.summaries import SummaryStatistics
 from torchrl_bayessim.transforms import DomainRandomizer
+
+LOGGERS = ("csv", "tensorboard", "wandb", "mlflow")
 
 
 @dataclass
@@ -62,9 +67,12 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
     torch.set_num_threads(1)  # batches are small: a second thread only costs
     task = TASKS[settings.task]
     if settings.short:
-        settings.episodes, settings.simulations, settings.updates = 4, 192, 2
+        settings.simulations, settings.updates = min(settings.simulations, 192), 2
+        task = dataclasses.replace(task, shared_batches=1)
     truth = true_parameters(task, settings)
     score = Score(task, truth, episodes=16 if settings.short else 100)
+    if settings.logger not in LOGGERS:
+        raise ValueError(message("a logger", settings.logger, available=LOGGERS))
     logger = get_logger(settings.logger, logger_name=str(out), experiment_name="log")
 
     loop, learner = make_loop(task, truth, settings, out)
@@ -133,7 +141,7 @@ def make_loop(
             task.prior,
             simulations=settings.simulations,
             seed=settings.seed,
-            fit_options={"progress": settings.progress},
+            fit_options={"progress": settings.progress, "epochs": 40 if settings.short else 300},
         ),
         statistics=SummaryStatistics(*task.summaries),
         randomizer=randomizer,
@@ -171,6 +179,7 @@ class Journal:
 
     def __init__(self, path: Path, *, resume: bool) -> None:
         self.path = path
+        resume = resume and path.exists()  # not before the end of the first round
         self.rounds: list[dict[str, Any]] = json.loads(path.read_text()) if resume else []
 
     def add(self, index: int, entry: dict[str, Any]) -> None:
@@ -183,7 +192,8 @@ class Baseline:
     """The same PPO under the prior, with as many frames, in a process beside the loop."""
 
     def __init__(self, settings: Sim2Real, *, frames: int) -> None:
-        self.pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+        spawn = get_context("spawn")
+        self.pool = ProcessPoolExecutor(1, mp_context=spawn, initializer=end_with_parent)
         if settings.baseline:
             self.future = self.pool.submit(train_under_prior, settings, frames=frames)
 
@@ -196,6 +206,18 @@ class Baseline:
     def result(self) -> tuple[dict[str, Tensor], list[dict[str, float]]]:
         """Return the policy's weights and the learning curve."""
         return self.future.result()
+
+
+def end_with_parent() -> None:
+    """End this process when its parent does, also if that is killed."""
+    parent = parent_process()
+    assert parent is not None  # it was spawned
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def train_under_prior(

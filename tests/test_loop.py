@@ -308,6 +308,12 @@ def test_settings_must_be_positive(name):
         make_loop(robot=make_robot(), **{name: 0})
 
 
+@pytest.mark.parametrize("name", ["updates", "shared_batches"])
+def test_other_settings_must_not_be_negative(name):
+    with pytest.raises(ValueError, match=f"{name} not to be negative, got -1"):
+        make_loop(**{name: -1})
+
+
 def test_more_than_ten_rounds():
     loop = make_loop(rounds=12, updates=1, horizon=4, simulations=12)
     turns = list(loop)

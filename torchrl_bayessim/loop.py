@@ -155,6 +155,9 @@ class SimToRealLoop:
         for name, value in self.settings.items():
             if value < 1:
                 raise ValueError(message(f"{name} to be positive", value))
+        for name, value in {"updates": updates, "shared_batches": shared_batches}.items():
+            if value < 0:
+                raise ValueError(message(f"{name} not to be negative", value))
         self.settings |= {
             "updates": updates,
             "shared_batches": shared_batches,
