@@ -1,0 +1,183 @@
+"""The main job from its command line, as users run it."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+RECIPE = Path(__file__).parent.parent / "recipes" / "sim2real_ppo.py"
+TINY = ["short=true", "progress=false", "rounds=2", "episodes=2", "simulations=48"]
+
+
+def start(*arguments, folder):
+    environment = os.environ | {"PYTHONWARNINGS": "ignore"}
+    return subprocess.Popen(
+        [sys.executable, str(RECIPE), *arguments],
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def run(*arguments, folder):
+    process = start(*arguments, folder=folder)
+    out, err = process.communicate(timeout=300)
+    return process.returncode, out, err
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Return the folder of an unbroken run, and what it printed."""
+    folder = tmp_path_factory.mktemp("finished")
+    status, out, err = run(*TINY, folder=folder)
+    assert status == 0, err
+    (made,) = (folder / "outputs" / "sim2real_ppo").iterdir()
+    return made, out
+
+
+def test_the_last_line_is_the_result_and_the_file_holds_the_same(finished):
+    folder, out = finished
+    *_, last = out.splitlines()
+    name, _, text = last.partition(" ")
+    assert name == "RESULT"
+    assert json.loads(text) == json.loads((folder / "result.json").read_text())
+
+
+def test_the_result_has_what_others_read(finished):
+    folder, _ = finished
+    result = json.loads((folder / "result.json").read_text())
+    assert {"task", "parameters", "true", "rounds", "baseline", "checkpoint"} <= result.keys()
+    assert result["task"] == "cartpole"
+    assert result["parameters"] == ["length", "masspole"]
+    assert result["true"] == pytest.approx([0.5, 0.1])
+    assert [entry["round"] for entry in result["rounds"]] == [1, 2]
+    for entry in result["rounds"]:
+        assert entry.keys() == {
+            *("round", "posterior_mean", "posterior_sd", "log_prob_true", "nats_over_prior"),
+            *("real_return", "real_return_ci", "sim_return", "frames", "simulations", "seconds"),
+        }
+        assert entry["simulations"] == 48
+        low, high = entry["real_return_ci"]
+        assert low <= entry["real_return"] <= high
+        for name, mean in zip(result["parameters"], entry["posterior_mean"], strict=True):
+            assert 0.1 <= mean <= 2.0, name
+    assert result["baseline"].keys() == {"source", "real_return", "real_return_ci"}
+    assert result["baseline"]["source"] == "prior"
+    told = result["provenance"]
+    assert {"commit", "versions", "seed", "command", "machine", "seconds"} <= told.keys()
+    assert {"cores", "threads"} <= told["machine"].keys()
+    assert told["seed"] == 0
+    assert "short=true" in told["command"]
+
+
+def test_pictures_curves_and_checkpoint_are_there(finished):
+    from matplotlib.image import imread
+
+    from torchrl_bayessim.checkpoint import load
+
+    folder, _ = finished
+    pictures = {path.stem for path in folder.glob("*.png")}
+    assert {"posterior", "return"} <= pictures
+    for name in pictures:
+        pixels = imread(folder / f"{name}.png")
+        assert min(pixels.shape[:2]) > 100
+        assert pixels[..., :3].std() > 0.01, name  # something is drawn
+    assert load(folder / "checkpoint.pt")["loop"]["round"] == 2
+    scalars = list(folder.rglob("*.csv"))
+    assert any("loss_objective" in path.name for path in scalars)
+    assert all(path.read_text().strip() for path in scalars)
+
+
+def without_times(result):
+    """Return a result without what depends on when and where it was made."""
+    rounds = [entry | {"seconds": None} for entry in result["rounds"]]
+    return {k: v for k, v in result.items() if k not in ("provenance", "checkpoint")} | {
+        "rounds": rounds
+    }
+
+
+def test_killed_in_mid_run_it_resumes_to_the_same_result(finished, tmp_path):
+    folder, _ = finished
+    process = start(*TINY, "out=run", folder=tmp_path)
+    deadline = time.monotonic() + 200
+    while not (tmp_path / "run/rounds.json").exists() and time.monotonic() < deadline:
+        assert process.poll() is None
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)  # in the second round
+    assert process.wait() == -signal.SIGKILL
+    process.communicate()  # returns when the process beside it has ended too
+    assert not (tmp_path / "run/result.json").exists()
+    status, _, err = run("resume=run", "progress=false", folder=tmp_path)
+    assert status == 0, err
+    expected, found = (
+        json.loads((path / "result.json").read_text()) for path in (folder, tmp_path / "run")
+    )
+    assert without_times(found) == without_times(expected)
+
+
+def test_bad_settings_end_in_one_line_and_status_2(tmp_path):
+    status, out, err = run("taks=pendulum", folder=tmp_path)
+    assert status == 2
+    assert out == ""
+    (line,) = err.splitlines()
+    assert line.startswith("sim2real_ppo: expected the name of a setting, got 'taks'.")
+    assert "task (did you mean this?)" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def refused(tmp_path, monkeypatch, capsys):
+    """Return what runs the recipe in this process and returns the one line that it ends with."""
+    monkeypatch.syspath_prepend(RECIPE.parent)
+    monkeypatch.chdir(tmp_path)
+    import recipe
+    import sim2real_ppo
+
+    def refuse(*arguments):
+        monkeypatch.setattr(sys, "argv", ["sim2real_ppo.py", *arguments])
+        with pytest.raises(SystemExit, match="2"):
+            recipe.main(sim2real_ppo.Sim2Real, sim2real_ppo.job)
+        (line,) = capsys.readouterr().err.splitlines()
+        return line
+
+    return refuse
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("task=pendulumm", "got 'pendulumm'. Available: pendulum (did you mean this?)"),
+        ("truth=nominall", "got 'nominall'. Available: nominal (did you mean this?), random"),
+        ("logger=cvs", "got 'cvs'. Available: csv (did you mean this?)"),
+        ("rounds=three", "expected values of the settings' types"),
+        ("rounds=2.5", "expected values of the settings' types"),
+        ("rounds", "expected arguments of the form key=value, got 'rounds'"),
+        ("rounds=0", "expected rounds to be positive, got 0"),
+        ("updates=-1", "expected updates not to be negative, got -1"),
+        ("resume=nowhere", "expected the folder of a run to resume, got 'nowhere'"),
+    ],
+)
+def test_bad_settings_are_explained(arguments, said, refused, tmp_path):
+    assert said in refused(arguments)
+    assert not (tmp_path / "nowhere").exists()
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("simulations=64", "expected simulations=48, as in the run to resume, got 64"),
+        ("truth=random", "expected truth=nominal, as in the run to resume, got 'random'"),
+        ("out=elsewhere", "as in the run to resume, got 'elsewhere'"),
+    ],
+)
+def test_a_run_resumes_with_its_own_settings_only(setting, said, finished, refused):
+    folder, _ = finished
+    assert said in refused(f"resume={folder}", setting)
+    assert not Path("elsewhere").exists()
