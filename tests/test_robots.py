@@ -1,7 +1,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import InteractionType, TensorDictModule
 from torchrl.envs import (
     CatTensors,
     Compose,
@@ -111,6 +111,16 @@ def test_the_robot_follows_the_policy_and_its_episodes_end_where_they_end():
     done = real["next", "done"].squeeze(-1)
     assert done.gather(-1, last).all()
     assert not (done & mask).sum(-1).gt(1).any()
+
+
+@pytest.mark.parametrize("default", ["DETERMINISTIC", "RANDOM"])
+def test_the_robot_explores_as_collectors_do_whatever_the_policy_does_by_default(default):
+    env = batched()
+    policy = PPO(env, hidden=(4,)).policy
+    policy[-1].default_interaction_type = InteractionType[default]
+    real = SurrogateRobot(env, [0.5], max_steps=8).rollouts(policy, episodes=3, key=(0,))
+    pushes = real["action"][..., 0].float()
+    assert 0.2 < pushes.mean() < 0.8  # an untrained policy: any action is as likely
 
 
 def test_a_policy_that_would_have_to_be_told_the_parameters_is_refused():

@@ -40,7 +40,7 @@ from .inference.fit import FitReport
 from .inference.physics_posterior import PhysicsPosterior
 from .inference.refinement import PosteriorRefinement
 from .randomness import isolated, seed_from
-from .robots import RealSystem
+from .robots import RealSystem, comparable
 from .simulate import ReplayActions, collect_summaries, make_collector
 from .sources import Defensive
 from .summaries import SummaryStatistics
@@ -235,7 +235,7 @@ class SimToRealLoop:
         key = (self.seed, "round", state["round"])
         real = self.robot.rollouts(policy, episodes=self.episodes, key=key)
         if not self.robot.recorded:
-            real = self._comparable(real)
+            real = comparable(real, horizon=self.horizon)
         evidence: list[dict[str, Any]] = [] if self.robot.recorded else state["evidence"]
         new = {
             "policy": dict(copy.deepcopy(policy).state_dict()),
@@ -244,23 +244,6 @@ class SimToRealLoop:
         }
         kept = real.select(*self.statistics.in_keys, "mask", ("next", "reward"), strict=False)
         state |= {"evidence": [*evidence, new], "real": _flatten(kept)}
-
-    def _comparable(self, real: TensorDictBase) -> TensorDictBase:
-        """Cut real episodes where simulated ones are cut; refuse those that were cut before."""
-        real = real[:, : self.horizon]
-        mask: Tensor = real.get("mask")
-        ended = (real.get(("next", "done")).reshape(mask.shape) & mask).any(-1)
-        length = mask.sum(-1)
-        short = ~ended & (length < self.horizon)
-        if short.any():
-            raise ValueError(
-                message(
-                    f"real episodes that end, or last the {self.horizon} steps of simulated ones",
-                    f"one cut after {int(length[short].min())}",
-                    hint="the same horizon for the loop and the robot",
-                )
-            )
-        return real
 
     def _infer(self) -> None:
         state, key = self._state, (self.seed, "round", self._state["round"])

@@ -7,7 +7,7 @@ once, whatever the policy.
 
 from __future__ import annotations
 
-__all__ = ["RealSystem", "RecordedLogs", "SurrogateRobot"]
+__all__ = ["RealSystem", "RecordedLogs", "SurrogateRobot", "comparable"]
 
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -17,6 +17,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from .errors import message
 from .randomness import isolated, seed_from
@@ -37,7 +38,10 @@ class RealSystem(Protocol):
     def rollouts(
         self, policy: TensorDictModuleBase, *, episodes: int, key: tuple[int | str, ...]
     ) -> TensorDictBase:
-        """Return trajectories ``[episodes, T]`` with a ``"mask"``, made by ``policy``."""
+        """Return trajectories ``[episodes, T]`` with a ``"mask"``, made by ``policy``.
+
+        The policy explores, as it does in simulation: ``ExplorationType.RANDOM``.
+        """
         ...
 
 
@@ -104,7 +108,8 @@ class SurrogateRobot:
         width = max(1, self._env.batch_size.numel())
         rows: list[TensorDictBase] = []
         for index in range(-(-episodes // width)):
-            with isolated(*key, "robot", index):
+            explore = set_exploration_type(ExplorationType.RANDOM)  # as collectors do
+            with isolated(*key, "robot", index), explore:
                 self._env.set_seed(seed_from(*key, "robot", index) % 2**31)
                 batch = self._env.rollout(
                     self.max_steps, policy, break_when_any_done=False, set_truncated=False
@@ -118,6 +123,32 @@ class SurrogateRobot:
 
 def _next(entry: NestedKey) -> NestedKey:
     return ("next", entry) if isinstance(entry, str) else ("next", *entry)
+
+
+def comparable(real: TensorDictBase, *, horizon: int) -> TensorDictBase:
+    """Cut real episodes where simulated ones are cut; refuse those that were cut before.
+
+    Args:
+        real: Trajectories ``[n, T]`` with a ``"mask"``.
+        horizon: Steps after which simulated trajectories are cut.
+
+    Raises:
+        ValueError: An episode neither ends nor lasts that long.
+    """
+    real = real[:, :horizon]
+    mask: Tensor = real.get("mask")
+    ended = (real.get(("next", "done")).reshape(mask.shape) & mask).any(-1)
+    length = mask.sum(-1)
+    short = ~ended & (length < horizon)
+    if short.any():
+        raise ValueError(
+            message(
+                f"real episodes that end, or last the {horizon} steps of simulated ones",
+                f"one cut after {int(length[short].min())}",
+                hint="the same horizon for the robot and the simulation",
+            )
+        )
+    return real
 
 
 class RecordedLogs:

@@ -36,7 +36,7 @@ class PosteriorRefinement:
 
     Args:
         prior: What is believed before any data.
-        simulations: Pairs per refinement.
+        simulations: Pairs per refinement, where it simulates itself.
         networks: Networks fitted each time, on other splits of the pairs; the posterior is their
             average, which is less sure where they disagree.
         make_posterior: ``(prior, summary size)`` to a fresh network; a default one if omitted.
@@ -63,7 +63,7 @@ class PosteriorRefinement:
         self,
         prior: Prior,
         *,
-        simulations: int,
+        simulations: int = 1024,
         networks: int = 2,
         make_posterior: Callable[[Prior, int], MixtureDensityPosterior] | None = None,
         margin: float = 1.0,
