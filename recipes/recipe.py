@@ -60,6 +60,9 @@ def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> No
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
         print(f"{name}: {text}", file=sys.stderr)
         raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print(f"{name}: stopped; resume=FOLDER goes on where a recipe has it", file=sys.stderr)
+        raise SystemExit(130) from None
     result["provenance"] = provenance(settings, seconds=time.monotonic() - start)
     text = json.dumps(plain(result))
     write(folder / "result.json", text + "\n")

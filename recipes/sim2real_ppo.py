@@ -17,7 +17,7 @@ import os
 import threading
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context, parent_process
+from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from typing import Any
 
@@ -208,7 +208,10 @@ class Baseline:
     def __enter__(self) -> Baseline:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None:  # nobody will ask for the result
+            for process in active_children():
+                process.terminate()
         self.pool.shutdown(cancel_futures=True)
 
     def result(self) -> tuple[dict[str, Tensor], list[dict[str, float]]]:

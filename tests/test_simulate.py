@@ -5,17 +5,18 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.envs import Compose, GymEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import Compose, GymEnv, SerialEnv, StepCounter, Transform, TransformedEnv
 
+from torchrl_bayessim.agents.ppo import PPO
 from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
-from torchrl_bayessim.errors import PhysicsError
+from torchrl_bayessim.errors import PhysicsError, SimulationError
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.physics.attributes import AttributePhysics
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
 from torchrl_bayessim.simulate import ReplayActions, collect_summaries, make_collector, simulate
 from torchrl_bayessim.sources import draw
-from torchrl_bayessim.summaries import SummaryStatistics, duration, moments
+from torchrl_bayessim.summaries import SummaryStatistics, duration, linear_dynamics, moments
 from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
 
 PRIOR = BoxPrior({"length": (0.2, 1.5)})
@@ -218,3 +219,31 @@ def test_actions_that_cannot_be_replayed_are_refused():
         ReplayActions(torch.zeros(0, 4, 2))
     with pytest.raises(ValueError, match="finite recorded actions"):
         ReplayActions(torch.full((1, 4, 2), torch.nan))
+
+
+def test_a_simulator_that_hands_nan_to_the_policy_is_named():
+    class Diverging(Transform):
+        def _step(self, tensordict, next_tensordict):
+            far = next_tensordict["observation"].abs().sum(-1, keepdim=True) > 0.5
+            observation = next_tensordict["observation"].masked_fill(far, torch.nan)
+            return next_tensordict.set("observation", observation)
+
+    prior = BoxPrior({"length": (0.1, 2.0)})
+    randomizer = DomainRandomizer(prior)
+    physics = ApplyPhysics(AttributePhysics("length"))
+    env = TransformedEnv(CartPoleEnv(8), Compose(physics, randomizer, Diverging()))
+    policy = PPO(env).policy
+    statistics = SummaryStatistics(linear_dynamics)
+    with pytest.raises(SimulationError, match="does a simulation diverge"):
+        simulate(env, policy, statistics, randomizer, pairs=8, max_steps=60, progress=False)
+
+
+@pytest.mark.parametrize("name", ["pairs", "max_steps", "trajectories"])
+def test_counts_are_positive(name):
+    counts = {"pairs": 4, "max_steps": 4, "trajectories": 1} | {name: 0}
+    randomizer = DomainRandomizer(BoxPrior({"length": (0.1, 2.0)}))
+    env = TransformedEnv(
+        CartPoleEnv(4), Compose(ApplyPhysics(AttributePhysics("length")), randomizer)
+    )
+    with pytest.raises(ValueError, match=f"{name} to be positive"):
+        simulate(env, None, SummaryStatistics(linear_dynamics), randomizer, **counts)

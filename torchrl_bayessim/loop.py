@@ -41,7 +41,7 @@ from .inference.physics_posterior import PhysicsPosterior
 from .inference.refinement import PosteriorRefinement
 from .randomness import isolated, seed_from
 from .robots import RealSystem, comparable
-from .simulate import ReplayActions, collect_summaries, make_collector
+from .simulate import ReplayActions, collect_summaries, make_collector, next_batch
 from .sources import Defensive
 from .summaries import SummaryStatistics
 from .trajectories import concatenate, first_trajectories
@@ -282,7 +282,7 @@ class SimToRealLoop:
         label = f"round {state['round'] + 1} of {self.rounds}: train"
         for update in tqdm(range(first, last), desc=label, disable=not self.progress, leave=False):
             with isolated(*key, update):
-                batch: Any = self._collect().next()
+                batch = next_batch(self._collect())
             self._update(batch.reshape(-1, batch.shape[-1]))
         state["update"] = last
 

@@ -7,7 +7,7 @@ here; for recorded data, :class:`ReplayActions` repeats the recorded actions.
 
 from __future__ import annotations
 
-__all__ = ["ReplayActions", "collect_summaries", "make_collector", "simulate"]
+__all__ = ["ReplayActions", "collect_summaries", "make_collector", "next_batch", "simulate"]
 
 from collections.abc import Callable
 from typing import Any
@@ -20,7 +20,7 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
-from .errors import PhysicsError, message
+from .errors import PhysicsError, SimulationError, message
 from .randomness import isolated, seed_from
 from .sources import Grid, draw
 from .summaries import SummaryStatistics
@@ -93,6 +93,25 @@ def make_collector(env: EnvBase, policy: TensorDictModuleBase | None, *, steps: 
         )
 
 
+def next_batch(collector: BaseCollector) -> Any:
+    """Return the collector's next batch.
+
+    Raises:
+        SimulationError: The collector failed, for instance because a policy was given NaN.
+    """
+    try:
+        return collector.next()
+    except RuntimeError as error:
+        raise SimulationError(
+            message(
+                "a batch of finite observations from the simulator",
+                str(error).splitlines()[0],
+                hint="does a simulation diverge? Let the environment end such an episode with its "
+                "last finite observation, as the batched environments do",
+            )
+        ) from error
+
+
 def collect_summaries(
     collector: BaseCollector,
     statistics: SummaryStatistics,
@@ -141,7 +160,7 @@ def collect_summaries(
             with isolated(*key, index):
                 collector.set_seed(seed_from(*key, index, "env") % 2**31)
                 collector.reset()
-                batch: Any = collector.next()
+                batch = next_batch(collector)
             batch = batch.reshape(-1, batch.shape[-1])
             _check_held(batch.get(randomizer.key, None), rows[done:])
             if index < keep:
@@ -215,6 +234,10 @@ def simulate(
         ...          max_steps=30, progress=False)["summary"].shape
         torch.Size([100, 28])
     """
+    counts = {"pairs": pairs, "max_steps": max_steps, "trajectories": trajectories}
+    for name, value in counts.items():
+        if value < 1:
+            raise ValueError(message(f"{name} to be positive", value))
     collector = make_collector(env, policy, steps=max_steps)
     theta = draw(randomizer.source, pairs, key=(seed, "theta"))  # pyright: ignore[reportArgumentType]
     try:

@@ -324,3 +324,21 @@ def test_one_parameter_and_one_statistic_can_be_fitted():
     data = TensorDict({"theta": theta, "summary": theta + 0.1}, [20])
     net = MixtureDensityPosterior(prior, 1, components=1)
     assert math.isfinite(short_fit(net, data).best)
+
+
+@pytest.mark.parametrize("weight", [torch.zeros(64), -torch.ones(64), torch.full((64,), torch.nan)])
+def test_weights_that_teach_nothing_are_refused(weight):
+    prior = BoxPrior({"a": (0.0, 1.0)})
+    theta = prior.sample((64,), generator=generator(0))
+    data = TensorDict({"theta": theta, "summary": theta, "weight": weight}, [64])
+    with pytest.raises(ValueError, match="finite weights of 0 or more"):
+        fit(MixtureDensityPosterior(prior, 1), data, progress=False)
+
+
+@pytest.mark.parametrize("options", [{"epochs": 0}, {"batch_size": 0}])
+def test_epochs_and_batches_are_positive(options):
+    prior = BoxPrior({"a": (0.0, 1.0)})
+    theta = prior.sample((8,), generator=generator(0))
+    data = TensorDict({"theta": theta, "summary": theta}, [8])
+    with pytest.raises(ValueError, match="positive epochs and batch_size"):
+        fit(MixtureDensityPosterior(prior, 1), data, progress=False, **options)

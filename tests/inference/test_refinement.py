@@ -208,3 +208,11 @@ def test_a_robot_that_does_what_the_simulator_cannot_is_noticed(seed):
     assert "of 100 simulated ones" in apart
     assert float(re.search(r"number \d+ by ([\d.e+]+),", apart)[1]) > 100
     assert "Does the prior hold the real parameters, and the simulator all that" in apart
+
+
+def test_sizes_are_checked_at_construction():
+    prior = BoxPrior({"a": (0.0, 1.0)})
+    with pytest.raises(ValueError, match="at least 4 simulations and 1 network"):
+        PosteriorRefinement(prior, simulations=0)
+    with pytest.raises(ValueError, match="positive components and summary size"):
+        MixtureDensityPosterior(prior, 3, components=0)

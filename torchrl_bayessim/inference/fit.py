@@ -104,6 +104,8 @@ def fit(
     """
     if not 0 < validation_fraction < 1:
         raise ValueError(message("a validation_fraction between 0 and 1", validation_fraction))
+    if epochs < 1 or batch_size < 1:
+        raise ValueError(message("positive epochs and batch_size", (epochs, batch_size)))
     pairs, dropped = usable_pairs(data.select("theta", "summary", "weight", strict=False))
     if dropped:
         warnings.warn(
@@ -137,6 +139,12 @@ def _check_pairs(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> N
     got = (pairs["theta"].shape[-1], pairs["summary"].shape[-1])
     if got != expected:
         raise ValueError(message("pairs with (D, L) of the posterior, " + str(expected), got))
+    weight = pairs.get("weight", None)
+    if weight is not None:
+        good = weight.isfinite() & (weight >= 0)
+        if not good.all() or not weight.any():
+            text = f"{int((~good).sum())} that are not, sum {weight.sum().item():.3g}"
+            raise ValueError(message("finite weights of 0 or more, some positive", text))
     outside = ~posterior.prior.contains(pairs["theta"])
     if outside.any():
         row = int(outside.nonzero()[0])

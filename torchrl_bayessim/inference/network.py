@@ -65,6 +65,10 @@ class MixtureDensityNetwork(nn.Module):
             raise ValueError(
                 message("a covariance structure", covariance, available=["diagonal", "full"])
             )
+        if components < 1 or features.dim < 1:
+            raise ValueError(
+                message("positive components and summary size", (components, features.dim))
+            )
         self.features = features
         self.parameters_, self.components, self.covariance = parameters, components, covariance
         self.reach, self.compress = reach, compress

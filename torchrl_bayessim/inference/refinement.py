@@ -71,6 +71,10 @@ class PosteriorRefinement:
         seed: int = 0,
         fit_options: Mapping[str, Any] | None = None,
     ) -> None:
+        if simulations < 4 or networks < 1:
+            raise ValueError(
+                message("at least 4 simulations and 1 network", (simulations, networks))
+            )
         self.prior, self.simulations, self.networks = prior, simulations, networks
         self.make_posterior = make_posterior or MixtureDensityPosterior
         self.margin, self.proposal_prior, self.seed = margin, proposal_prior, seed
