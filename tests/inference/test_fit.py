@@ -312,10 +312,10 @@ def test_pairs_of_other_shapes_are_refused(dims, size):
 
 
 def test_a_loss_that_is_not_finite_is_reported():
-    data = linear_gaussian(20)
-    data["weight"] = torch.full((20,), torch.nan)
+    broken = posterior()
+    torch.nn.init.constant_(broken.network.head.bias, torch.nan)
     with pytest.raises(SimulationError, match=r"a finite loss, got nan\. Try: a smaller learning"):
-        short_fit(posterior(), data)
+        short_fit(broken, linear_gaussian(20))
 
 
 def test_one_parameter_and_one_statistic_can_be_fitted():
