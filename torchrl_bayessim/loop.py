@@ -282,7 +282,7 @@ class SimToRealLoop:
         label = f"round {state['round'] + 1} of {self.rounds}: train"
         for update in tqdm(range(first, last), desc=label, disable=not self.progress, leave=False):
             with isolated(*key, update):
-                batch = next_batch(self._collect())
+                batch = next_batch(collector)
             self._update(batch.reshape(-1, batch.shape[-1]))
         state["update"] = last
 

@@ -4,13 +4,14 @@ Frames per second of a collector with the two transforms (a mass and two frictio
 read back at every reset), over the same collector without them, with episodes of 100 steps:
 ``GymEnv``, ``SerialEnv`` of four, and ``BatchedMujocoEnv`` of 64. Prints one JSON line per case::
 
-    python recipes/benchmarks/reset_overhead.py [runs=7] [steps=100] [seconds=2]
+    python recipes/benchmarks/reset_overhead.py [runs=7] [steps=100] [frames=4000]
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -29,6 +30,7 @@ from torchrl.envs import (
 from torchrl_bayessim import ApplyPhysics, BoxPrior, DomainRandomizer, MujocoPhysics
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.envs.task import Task
+from torchrl_bayessim.envs.tasks.catalogue import known_task
 
 PRIOR = BoxPrior({"mass": (2.0, 6.0), "friction": (0.4, 2.0)})
 
@@ -69,10 +71,6 @@ def batched(*, randomized: bool, steps: int) -> EnvBase:
 
 
 def _standing() -> Task:
-    from dataclasses import replace
-
-    from torchrl_bayessim.envs.tasks.catalogue import known_task
-
     return replace(known_task("Hopper-v5"), termination=None)
 
 

@@ -10,6 +10,7 @@ __all__ = ["ant", "half_cheetah", "hopper", "humanoid", "swimmer", "walker2d"]
 
 from collections.abc import Callable
 
+import mujoco
 import torch
 from torch import Tensor
 
@@ -39,45 +40,40 @@ def _planar_observation(now: Readings) -> Tensor:
     return torch.cat([now.qpos[..., 1:], now.qvel.clamp(-10.0, 10.0)], -1)
 
 
+def _legged(model: mujoco.MjModel, healthy: Callable[[Readings], Tensor]) -> Task:
+    """Return the task of legs in the plane that run until they are not healthy."""
+    return Task(
+        model=model,
+        frame_skip=4,
+        observation=_planar_observation,
+        reward=_forward_reward(4 * model.opt.timestep, 1e-3, healthy),
+        termination=lambda now: ~healthy(now),
+        reset=uniform_reset(model, 5e-3),
+        max_steps=1000,
+    )
+
+
 def hopper() -> Task:
     """Hopper-v5: one leg in the plane, hopping forward without falling."""
     model = gymnasium_model("hopper.xml")
-    dt = 4 * model.opt.timestep
 
     def healthy(now: Readings) -> Tensor:
         rest = torch.cat([now.qpos[..., 2:], now.qvel], -1).abs() < 100.0
         upright = _inside(now.qpos[..., 2], -0.2, 0.2)
         return rest.all(-1) & upright & (now.qpos[..., 1] > 0.7)
 
-    return Task(
-        model=model,
-        frame_skip=4,
-        observation=_planar_observation,
-        reward=_forward_reward(dt, 1e-3, healthy),
-        termination=lambda now: ~healthy(now),
-        reset=uniform_reset(model, 5e-3),
-        max_steps=1000,
-    )
+    return _legged(model, healthy)
 
 
 def walker2d() -> Task:
     """Walker2d-v5: two legs in the plane, walking without falling."""
     model = gymnasium_model("walker2d_v5.xml")
-    dt = 4 * model.opt.timestep
 
     def healthy(now: Readings) -> Tensor:
         upright = _inside(now.qpos[..., 2], -1.0, 1.0)
         return upright & _inside(now.qpos[..., 1], 0.8, 2.0)
 
-    return Task(
-        model=model,
-        frame_skip=4,
-        observation=_planar_observation,
-        reward=_forward_reward(dt, 1e-3, healthy),
-        termination=lambda now: ~healthy(now),
-        reset=uniform_reset(model, 5e-3),
-        max_steps=1000,
-    )
+    return _legged(model, healthy)
 
 
 def half_cheetah() -> Task:
