@@ -12,9 +12,10 @@ ROOT = Path(torchrl_bayessim.__file__).parent
 LAYERS = [
     {"errors", "randomness"},
     {"sources", "trajectories", "checkpoint", "plots", "physics", "envs", "evaluation"},
-    {"summaries", "episode_draws", "remote_source", "inference", "agents", "replay"},
+    {"summaries", "episode_draws", "remote_source", "inference", "agents", "replay", "effects"},
+    {"logs"},
     {"transforms"},
-    {"simulate", "robots"},
+    {"simulate", "robots", "diagnosis"},
     {"loop"},
     {"trainer"},
 ]

@@ -1,0 +1,213 @@
+"""What an effect is: a change to commands, forces, the model or measurements, with one strength.
+
+An effect is a law without state of its own. Strengths have shape ``(*batch, N)``, one for each of
+its ``N`` targets (see `Effect.targets`), zero where it is off; batches are environments or the
+candidates of a diagnosis. A law's hidden state (a delay line, the side of a backlash gap) is its
+*memory*, a dictionary of tensors with leading dimensions ``batch``: `start` returns it for the
+beginning of an episode, and each call returns the next one. Nothing is drawn inside a law: what is
+random reads ``now.noise``. So a law runs in a transform around any environment and in the batched
+replay of a diagnosis, with the same numbers.
+
+An effect of one's own is a short class::
+
+    class Hysteresis(ActionEffect):
+        name, unit, group = "hysteresis", "fraction", "gain"
+
+        def command(self, action, strength, memory, now):
+            return action * (1 - strength * (memory["last"] * action < 0)), {"last": action}
+
+        def start(self, action):
+            return {"last": torch.zeros_like(action)}
+
+        def bounds(self, robot):
+            return torch.zeros(len(robot.actuators)), torch.ones(len(robot.actuators))
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "ActionEffect",
+    "Effect",
+    "Fields",
+    "ForceEffect",
+    "Memory",
+    "ModelEffect",
+    "Now",
+    "SensorEffect",
+]
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import ClassVar, Protocol
+
+from torch import Tensor
+
+from .robot import Robot
+
+Memory = Mapping[str, Tensor]
+Now = SimpleNamespace
+"""What a law may look at; tensors ``(*batch, size)``.
+
+``time``: seconds since the episode began, ``(*batch, 1)``; ``noise``: uniform numbers in [0, 1) of
+this control step, as many as there are targets; where there is a MuJoCo model also ``position`` and
+``velocity`` of the joints ``(*batch, J)``, ``load``: the generalised force that actuators exert at
+the joints ``(*batch, J)``, ``command`` ``(*batch, A)``, ``actuator_velocity`` ``(*batch, A)``, and
+``timestep``, the seconds that a force is held (a float).
+"""
+
+
+class Effect(ABC):
+    """One cause, with one strength per target.
+
+    Attributes:
+        name: Its name in the catalogue.
+        unit: Of the strength: SI, or ``fraction``.
+        group: Effects of one group act alike; where data cannot tell them apart they are reported
+            together: ``timing``, ``friction``, ``gain``, ``offset``, ``elasticity``, ``inertia``,
+            ``contact``, ``geometry``, ``noise``, ``disturbance``.
+        channel: Where it sits: ``sensing``, ``actuation``, ``body`` or ``contact``.
+        random: Whether it changes the distribution of what is seen rather than its mean.
+    """
+
+    name: ClassVar[str]
+    unit: ClassVar[str]
+    group: ClassVar[str]
+    channel: ClassVar[str]
+    random: ClassVar[bool] = False
+
+    @abstractmethod
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the names of what it can act on, empty where it does not apply."""
+
+    @abstractmethod
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return the lowest and highest plausible strength of each target, shape ``(N,)`` each.
+
+        The lowest is zero, or negative where the sign is free.
+        """
+
+    def joint(self, robot: Robot, target: int) -> int:
+        """Return the joint at which a target sits, -1 for none."""
+        del robot, target
+        return -1
+
+
+class ActionEffect(Effect):
+    """Changes the command, at every control step; targets are actuators."""
+
+    channel = "actuation"
+    memoryless: ClassVar[bool] = False
+    """Whether the law depends on this step only, so that whole sequences are one call."""
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the actuators' names."""
+        return robot.actuators
+
+    def joint(self, robot: Robot, target: int) -> int:
+        """Return the joint that the actuator moves."""
+        return robot.joint_of_actuator[target]
+
+    def start(self, action: Tensor) -> Memory:
+        """Return the memory at the beginning, for actions of this shape and kind."""
+        del action
+        return {}
+
+    @abstractmethod
+    def command(
+        self, action: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return what reaches the actuators, shape ``(*batch, A)``, and the new memory."""
+
+
+class ForceEffect(Effect):
+    """Adds to forces, friction, damping or commands at every time step of a MuJoCo model.
+
+    Targets are joints unless `targets` says otherwise.
+    """
+
+    channel = "body"
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the joints' names."""
+        return robot.joints
+
+    def joint(self, robot: Robot, target: int) -> int:
+        """Return the joint."""
+        del robot
+        return target
+
+    def start(self, velocity: Tensor) -> Memory:
+        """Return the memory at the beginning, for joint velocities of this shape and kind."""
+        del velocity
+        return {}
+
+    @abstractmethod
+    def forces(
+        self, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Mapping[str, Tensor], Memory]:
+        """Return what is added in this time step, and the new memory.
+
+        Returns:
+            Any of ``force``, ``frictionloss`` and ``damping``, shape ``(*batch, J)`` in N m or N
+            (dry friction and damping are solved implicitly, and so stay stable), and ``command``,
+            shape ``(*batch, A)``.
+        """
+
+
+class Fields(Protocol):
+    """Entries of the model, by ``MjModel`` field and index, in every member of a batch."""
+
+    def __getitem__(self, entry: tuple[str, tuple[int, ...]]) -> Tensor:
+        """Return the value that holds without effects (or with those before), shape ``batch``."""
+        ...
+
+    def __setitem__(self, entry: tuple[str, tuple[int, ...]], value: Tensor) -> None:
+        """Set the value, shape ``batch``."""
+        ...
+
+
+class ModelEffect(Effect):
+    """Changes entries of a MuJoCo model, once, at the beginning."""
+
+    channel = "body"
+
+    @abstractmethod
+    def write(self, fields: Fields, strength: Tensor, robot: Robot) -> None:
+        """Set entries, given their values without the effect; masses bring their inertias along."""
+
+
+class SensorEffect(Effect):
+    """Changes what is measured, at every control step; targets are channels."""
+
+    channel = "sensing"
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the channels' names."""
+        return robot.channels
+
+    def joint(self, robot: Robot, target: int) -> int:
+        """Return the joint that the channel measures."""
+        return robot.channel_joint[target]
+
+    def start(self, reading: Tensor) -> Memory:
+        """Return the memory at the beginning, given the first true values."""
+        del reading
+        return {}
+
+    @abstractmethod
+    def measure(
+        self, reading: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return what is measured of the true values, shape ``(*batch, C)``, and the new memory."""
+
+    def restore(self, measured: Tensor, strength: Tensor, dt: float) -> Tensor:
+        """Return the true values behind a whole record, as far as they can be known.
+
+        Args:
+            measured: The record, shape ``(*batch, T, C)``.
+            strength: Shape ``(*batch, C)``.
+            dt: Seconds per step.
+        """
+        del strength, dt
+        return measured
