@@ -45,7 +45,7 @@ from .simulate import ReplayActions, collect_summaries, make_collector, next_bat
 from .sources import Defensive
 from .summaries import SummaryStatistics
 from .trajectories import concatenate, first_trajectories
-from .transforms import DomainRandomizer
+from .transforms.domain_randomizer import DomainRandomizer
 
 
 class Learner(Protocol):

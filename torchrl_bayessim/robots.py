@@ -23,7 +23,7 @@ from .errors import message
 from .randomness import isolated, seed_from
 from .sources import Grid
 from .trajectories import concatenate, first_trajectories
-from .transforms import DomainRandomizer
+from .transforms.domain_randomizer import DomainRandomizer
 
 
 class RealSystem(Protocol):

@@ -25,7 +25,7 @@ from .randomness import isolated, seed_from
 from .sources import Grid, draw
 from .summaries import SummaryStatistics
 from .trajectories import concatenate, first_trajectories
-from .transforms import DomainRandomizer
+from .transforms.domain_randomizer import DomainRandomizer
 
 
 class ReplayActions(TensorDictModuleBase):

@@ -30,7 +30,7 @@ from .remote_source import push_source
 from .robots import RealSystem, comparable
 from .sources import Defensive, Source
 from .summaries import SummaryStatistics
-from .transforms import DomainRandomizer
+from .transforms.domain_randomizer import DomainRandomizer
 
 
 class PosteriorTrainerHook(TrainerHookBase):

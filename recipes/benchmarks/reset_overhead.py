@@ -2,7 +2,9 @@
 
 Frames per second of a collector with the two transforms (a mass and two frictions drawn, written,
 read back at every reset), over the same collector without them, with episodes of 100 steps:
-``GymEnv``, ``SerialEnv`` of four, and ``BatchedMujocoEnv`` of 64. Prints one JSON line per case::
+``GymEnv``, ``SerialEnv`` of four, and ``BatchedMujocoEnv`` of 64. ``plain`` has no transform beside
+the simulator, ``idle`` transforms that do nothing in the places of the two: what a step costs more
+with any transform there is TorchRL's. Prints one JSON line per case::
 
     python recipes/benchmarks/reset_overhead.py [runs=7] [steps=100] [frames=4000]
 """
@@ -16,6 +18,7 @@ from functools import partial
 
 import torch
 from measuring import compare, options, report
+from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import (
     Compose,
@@ -24,6 +27,7 @@ from torchrl.envs import (
     GymEnv,
     SerialEnv,
     StepCounter,
+    Transform,
     TransformedEnv,
 )
 
@@ -50,24 +54,47 @@ def hopper() -> EnvBase:
     return GymEnv("Hopper-v5", terminate_when_unhealthy=False)
 
 
-def single(*, randomized: bool, steps: int) -> EnvBase:
+class Idle(Transform):
+    """A transform that does nothing: what TorchRL takes for any transform at all."""
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        del tensordict
+        return next_tensordict
+
+
+def single(case: str, *, steps: int) -> EnvBase:
     """Return one environment."""
-    extra = [apply(), DomainRandomizer(PRIOR)] if randomized else []
-    return TransformedEnv(hopper(), Compose(*extra, StepCounter(steps), DoubleToFloat()))
+    beside: list[Transform] = {
+        "plain": [],
+        "idle": [Idle(), Idle()],
+        "randomized": [apply(), DomainRandomizer(PRIOR)],
+    }[case]
+    return TransformedEnv(hopper(), Compose(*beside, StepCounter(steps), DoubleToFloat()))
 
 
-def serial(*, randomized: bool, steps: int) -> EnvBase:
+def serial(case: str, *, steps: int) -> EnvBase:
     """Return four environments, with the randomizer outside."""
-    make = (lambda: TransformedEnv(hopper(), apply())) if randomized else hopper
-    extra = [DomainRandomizer(PRIOR)] if randomized else []
-    return TransformedEnv(SerialEnv(4, make), Compose(*extra, StepCounter(steps), DoubleToFloat()))
+    beside = {"plain": None, "idle": Idle, "randomized": apply}[case]
+    make = hopper if beside is None else lambda: TransformedEnv(hopper(), beside())
+    outside: list[Transform] = {
+        "plain": [],
+        "idle": [Idle()],
+        "randomized": [DomainRandomizer(PRIOR)],
+    }[case]
+    return TransformedEnv(
+        SerialEnv(4, make), Compose(*outside, StepCounter(steps), DoubleToFloat())
+    )
 
 
-def batched(*, randomized: bool, steps: int) -> EnvBase:
+def batched(case: str, *, steps: int) -> EnvBase:
     """Return 64 environments that step in one native call."""
     env = BatchedMujocoEnv(_standing(), 64, threads=1)
-    extra = [apply(), DomainRandomizer(PRIOR)] if randomized else []
-    return TransformedEnv(env, Compose(*extra, StepCounter(steps)))
+    beside: list[Transform] = {
+        "plain": [],
+        "idle": [Idle(), Idle()],
+        "randomized": [apply(), DomainRandomizer(PRIOR)],
+    }[case]
+    return TransformedEnv(env, Compose(*beside, StepCounter(steps)))
 
 
 def _standing() -> Task:
@@ -88,22 +115,18 @@ def main(*arguments: str) -> None:
     torch.set_num_threads(1)
     for name, make in {"GymEnv": single, "SerialEnv": serial, "BatchedMujocoEnv": batched}.items():
         cases: dict[str, Callable[[], int]] = {}
-        for label in ("plain", "randomized"):
-            env = make(randomized=label == "randomized", steps=given["steps"])
+        for case in ("plain", "idle", "randomized"):
+            env = make(case, steps=given["steps"])
             rows = max(1, env.batch_size.numel())
             collector = Collector(env, frames_per_batch=rows * 200, total_frames=-1)
             frames = given["frames"] * (5 if rows == 64 else 1)
-            cases[label] = partial(collect, collector, frames)
+            cases[case] = partial(collect, collector, frames)
         rates = compare(cases, runs=given["runs"])
-        report("reset_overhead", f"{name} plain", rates["plain"], steps=given["steps"])
-        against = {"plain": rates["plain"]}
-        report(
-            "reset_overhead",
-            f"{name} randomized",
-            rates["randomized"],
-            against=against,
-            steps=given["steps"],
-        )
+        for case, values in rates.items():
+            others = {other: rates[other] for other in ("plain", "idle") if other != case}
+            against = others if case == "randomized" else None
+            label = f"{name} {case}"
+            report("reset_overhead", label, values, against=against, steps=given["steps"])
 
 
 if __name__ == "__main__":

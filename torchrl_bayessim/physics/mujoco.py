@@ -113,7 +113,8 @@ class MujocoPhysics:
         columns = []
         for group in entries:
             held = np.stack([e.sign * models.read(e.field, i) for e in group for i in e.indices])
-            same = np.isclose(held, held[0], rtol=1e-9, atol=0).all(0)
+            # not np.isclose, which takes longer than all else here
+            same = (np.abs(held - held[0]) <= 1e-9 * np.abs(held[0])).all(0)
             columns.append(np.where(same, held[0], np.nan))
         return torch.from_numpy(np.stack(columns, -1)).reshape(*getattr(env, "batch_size", ()), -1)
 
