@@ -182,6 +182,20 @@ class ModelBatch:
         self.table = self.table[:num_envs].copy()
         self.num_envs = num_envs
 
+    def restore(self) -> None:
+        """Give all environments the nominal physics."""
+        self.table[:] = [self._nominal(*key) for key in self._columns]
+
+    def repeated(self, count: int) -> ModelBatch:
+        """Return a batch in which the physics of each environment stands ``count`` times in a row.
+
+        Both know the same entries, and the same of them are overridden, from then on separately.
+        """
+        other = ModelBatch(self.model, self.num_envs * count)
+        other._columns = dict(self._columns)
+        other.table = np.repeat(self.table, count, axis=0)
+        return other
+
     def addresses(self, model: mujoco.MjModel) -> NDArray[np.int64]:
         """Return where the columns of the table belong in a copy of the model, shape ``(K,)``.
 

@@ -161,6 +161,15 @@ class Stepper:
         self.status = np.zeros(num_envs, dtype=np.int64)
         self._all = np.arange(num_envs)
 
+    def use(self, models: ModelBatch) -> None:
+        """Step with these physics from now on, one row per ``sharing`` simulations."""
+        if models.num_envs * self._sharing != self.num_envs:
+            expected = f"the physics of {self.num_envs // self._sharing} environments"
+            raise ValueError(message(expected, models.num_envs))
+        self.models = models
+        for worker in self._workers:  # the columns may be others
+            worker.addresses = np.empty(0, dtype=np.int64)
+
     def __getitem__(self, component: str) -> NDArray[np.float64]:
         """Return a view of a component of the states, such as ``qpos``, shape ``(N, size)``."""
         if component not in self.components:
