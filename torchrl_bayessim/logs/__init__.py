@@ -1,0 +1,1 @@
+"""How logs of a robot come in: its description, reading, resampling and a sanity gate."""

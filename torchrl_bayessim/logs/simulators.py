@@ -1,0 +1,131 @@
+"""The simulator that a description names, as a task.
+
+``robot.xml``                    an MJCF file beside the description
+``gymnasium:Hopper-v5``          a MuJoCo task of Gymnasium
+``dm_control:cartpole/swingup``  a task of the DeepMind Control Suite
+
+An MJCF file may include files and meshes of its own folder only, so that a description from
+elsewhere cannot read the rest of the disk.
+"""
+
+from __future__ import annotations
+
+__all__ = ["simulator_task"]
+
+
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+
+from ..envs.task import Task
+from ..envs.tasks.catalogue import known_task
+from ..errors import message
+
+
+def simulator_task(simulator: str, folder: Path, control_dt: float | None) -> Task:
+    """Return the task that a description's ``simulator`` names.
+
+    Args:
+        simulator: As above.
+        folder: Where the description is.
+        control_dt: Seconds between actions, a multiple of the model's time step; ``None`` for that
+            of the named task.
+
+    Raises:
+        ValueError: There is no such simulator, its file cannot be compiled or leaves the folder, or
+            ``control_dt`` is not a multiple of the time step.
+
+    Example:
+        >>> simulator_task("gymnasium:Hopper-v5", Path(), 0.016).frame_skip
+        8
+    """
+    kind, colon, name = simulator.partition(":")
+    if not colon:
+        if control_dt is None:
+            raise ValueError(message("control_dt beside an MJCF file", "none"))
+        return at_control_step(Task(model=_compiled(folder, simulator), frame_skip=1), control_dt)
+    if kind == "gymnasium":
+        task = known_task(name)
+    elif kind == "dm_control":
+        task = _suite_task(name)
+    else:
+        expected = "an MJCF file, gymnasium:NAME or dm_control:DOMAIN/TASK"
+        raise ValueError(message(expected, simulator))
+    return task if control_dt is None else at_control_step(task, control_dt)
+
+
+def at_control_step(task: Task, control_dt: float) -> Task:
+    """Return the task with as many time steps per control step as ``control_dt`` has.
+
+    Raises:
+        ValueError: That is not a whole number of at least one.
+    """
+    timestep = task.model.opt.timestep
+    steps = round(control_dt / timestep) if 0 < control_dt < 1e6 else 0
+    if steps < 1 or abs(steps * timestep - control_dt) > 1e-6 * control_dt:
+        hint = "change the model's <option timestep> or control_dt"
+        expected = f"control_dt to be a multiple of the model's time step {timestep:g} s"
+        raise ValueError(message(expected, control_dt, hint=hint))
+    return replace(task, frame_skip=steps)
+
+
+def _suite_task(name: str) -> Task:
+    from dm_control import suite  # slow to import
+
+    names = [f"{domain}/{task}" for domain, task in suite.ALL_TASKS]
+    if name not in names:
+        expected = "a task of the control suite as dm_control:DOMAIN/TASK"
+        raise ValueError(message(expected, name, available=names))
+    domain, task = name.split("/")
+    env = suite.load(domain, task)
+    model = env.physics.model.ptr
+    return at_control_step(Task(model=model, frame_skip=1), env.control_timestep())
+
+
+def _compiled(folder: Path, name: str) -> mujoco.MjModel:
+    path = _inside(folder, Path(name), name)
+    _check_files(folder.resolve(), path, seen=set())
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(message(f"an MJCF file that compiles in {name}", reason)) from None
+
+
+def _inside(folder: Path, name: Path, shown: str) -> Path:
+    path = (folder / name).resolve()
+    if not path.is_relative_to(folder.resolve()):
+        raise ValueError(message("files inside the folder of system.yaml", shown))
+    if not path.is_file():
+        available = [p.name for p in folder.glob("*.xml")]
+        raise ValueError(message("a file that exists", shown, available=available))
+    return path
+
+
+def _check_files(folder: Path, path: Path, *, seen: set[Path]) -> None:
+    """Follow everything that a file of the model refers to."""
+    if path in seen:
+        return
+    seen.add(path)
+    try:
+        root = ElementTree.parse(path).getroot()  # expat bounds entity expansion
+    except (ElementTree.ParseError, ValueError) as error:
+        raise ValueError(message(f"XML in {path.name}", str(error))) from None
+    roots = [path.parent]
+    for element in root.iter("compiler"):
+        roots += [path.parent / element.get(key, "") for key in _FOLDERS]
+    for element in root.iter():
+        for key, value in element.attrib.items():
+            if not key.startswith("file"):
+                continue
+            found = [(place / value).resolve() for place in roots]
+            if not all(file.is_relative_to(folder) for file in found):
+                raise ValueError(message("files inside the folder of system.yaml", value))
+            for file in found:
+                if element.tag in {"include", "model"} and file.is_file():
+                    _check_files(folder, file, seen=seen)
+
+
+_FOLDERS = ("meshdir", "texturedir", "assetdir")
