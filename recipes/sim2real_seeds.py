@@ -31,6 +31,7 @@ class Seeds(recipe.Settings):
     task: str = "cartpole"
     truth: str = "nominal"
     seeds: int = 5
+    updates: int = 0  # PPO updates per round; 0 for the task's own number
     short: bool = False
     processes: int = 2
 
@@ -59,6 +60,7 @@ def job(settings: Seeds, out: Path) -> dict[str, Any]:
         "task": settings.task,
         "parameters": parameters,
         "seeds": settings.seeds,
+        "frames": runs[0]["rounds"][-1]["frames"],
         "rounds": rounds,
         "baseline": interval([run["baseline"]["real_return"] for run in runs]),
         "gain": interval(gains),
@@ -76,6 +78,7 @@ def one(settings: Seeds, out: Path, seed: int) -> dict[str, Any]:
     arguments = {
         "task": settings.task,
         "truth": settings.truth,
+        "updates": settings.updates,
         "short": settings.short,
         "seed": seed,
         "out": folder,
@@ -103,7 +106,8 @@ def table(result: dict[str, Any]) -> str:
         return f"{entry['mean']:.2f} [{entry['low']:.2f}, {entry['high']:.2f}]"
 
     lines = [
-        f"{result['task']}, {result['seeds']} seeds, mean and 95 % interval over seeds",
+        f"{result['task']}, {result['seeds']} seeds, {result['frames']:,} frames, mean and 95 % "
+        "interval over seeds",
         "",
         "| | nats over the prior per parameter | return at the robot |",
         "|---|---|---|",

@@ -16,6 +16,7 @@ LAYERS = [
     {"logs"},
     {"transforms"},
     {"simulate", "robots", "diagnosis"},
+    {"evidence"},
     {"loop"},
     {"trainer"},
 ]

@@ -69,12 +69,13 @@ def make_loop(env=None, randomizer=None, *, learner=None, robot=None, **options)
         "rounds": 2,
     } | options
     fit = {"make_posterior": small, "networks": 1, "fit_options": QUICK}
+    epochs = options.pop("epochs", 1)
     return SimToRealLoop(
         env,
-        learner or PPO(env, hidden=(4,), minibatch_size=30, epochs=1),
+        learner or PPO(env, hidden=(4,), minibatch_size=30, epochs=epochs),
         robot or make_robot(options["episodes"], options["horizon"]),
         refinement=PosteriorRefinement(prior, simulations=options.pop("simulations", 24), **fit),
-        statistics=SummaryStatistics(moments, duration),
+        statistics=options.pop("statistics", SummaryStatistics(moments, duration)),
         randomizer=randomizer,
         checkpoint_every=2,
         progress=False,
@@ -160,7 +161,7 @@ def test_each_round_simulates_under_every_policy_that_made_real_data(monkeypatch
         used.append(dict(copy.deepcopy(policy).state_dict()))
         return make_collector(env, policy, steps=steps)
 
-    monkeypatch.setattr("torchrl_bayessim.loop.make_collector", watching)
+    monkeypatch.setattr("torchrl_bayessim.evidence.make_collector", watching)
     loop = make_loop(rounds=3, updates=1)
     sizes = [turn.fit.pairs for turn in loop]
     policies = [entry["policy"] for entry in loop.state_dict()["loop"]["evidence"]]
@@ -177,9 +178,9 @@ def test_a_later_summary_is_another_one_because_the_policy_is():
     list(loop)
     first, second = loop.state_dict()["loop"]["evidence"]
     theta = torch.linspace(0.3, 1.2, 8).unsqueeze(-1)
-    under_first = loop._repeat(first, theta, (0,))
-    under_second = loop._repeat(second, theta, (0,))
-    assert torch.equal(under_first, loop._repeat(first, theta, (0,)))
+    under_first = loop._simulator.earlier(first, theta, key=(0,))
+    under_second = loop._simulator.earlier(second, theta, key=(0,))
+    assert torch.equal(under_first, loop._simulator.earlier(first, theta, key=(0,)))
     assert not torch.allclose(under_first, under_second, rtol=0.05)
 
 
@@ -211,14 +212,14 @@ def test_the_batches_that_made_the_pairs_improve_the_policy_too(monkeypatch):
 def test_training_draws_from_the_posterior_mixed_with_the_prior():
     env, randomizer = make_env(width=200)
     learner = Recorder(env)
-    loop = make_loop(env, randomizer, learner=learner, rounds=1, updates=1, defensive=0.25)
+    loop = make_loop(env, randomizer, learner=learner, rounds=1, updates=1, prior_share=0.25)
     assert randomizer.source is PRIOR
     (turn,) = loop
     source = randomizer.source
     assert isinstance(source, Defensive)
     assert source.source is turn.posterior
     assert source.prior is PRIOR
-    assert source.weight == 0.25
+    assert source.prior_share == 0.25
     starts = learner.batches[-1][:, 0]
     assert (starts["step_count"] == 0).all()
     assert (source.log_prob(starts["theta"]) > -math.inf).all()
@@ -280,7 +281,7 @@ def test_hopper_with_two_parameters():
         {"updates": 0},
         {"shared_batches": 0},
         {"horizon": 2},
-        {"defensive": 0.0},
+        {"prior_share": 0.0},
         {"simulations": 4},
     ],
     ids=str,
@@ -600,12 +601,17 @@ def test_without_a_file_there_is_nothing_to_resume(tmp_path):
         ({"horizon": 11}, "made with horizon=11, got 10"),
         ({"episodes": 3}, "made with episodes=3, got 2"),
         ({"seed": 5}, "made with seed=5, got 0"),
-        ({"simulations": 30}, "made with simulations=30, got 24"),
-        ({"defensive": 0.5}, r"made with defensive=0.5, got 0.1"),
+        ({"simulations": 30}, "made with refinement.simulations=30, got 24"),
+        ({"prior_share": 0.5}, r"made with prior_share=0.5, got 0.1"),
+        (
+            {"statistics": SummaryStatistics(moments)},
+            r"made with statistics=.SummaryStatistics\(moments, angles.*got .*duration",
+        ),
+        ({"epochs": 2}, r"made with learner.epochs=2, got 1"),
         ({"env": make_env(7)}, "made with environments=7, got 6"),
         (
             {"env": make_env(prior=BoxPrior({"length": (0.2, 1.6)}))},
-            r"made with prior='BoxPrior\(length: \[0.2, 1.6\]\)', got .*\[0.2, 1.5\]",
+            r"made with refinement.prior='BoxPrior\(length: \[0.2, 1.6\]\)', got .*\[0.2, 1.5\]",
         ),
     ],
     ids=lambda value: value if isinstance(value, str) else None,

@@ -24,7 +24,7 @@ from torchrl_bayessim.summaries import (
     moments,
     waypoints,
 )
-from torchrl_bayessim.trajectories import pad
+from torchrl_bayessim.trajectories import first_trajectories, pad
 from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
 
 SUMMARIES = {
@@ -213,6 +213,34 @@ def test_waypoints_are_spread_over_each_trajectory_s_own_length():
     mask = torch.arange(12) < torch.tensor([[12], [6]])
     value = waypoints(3)(states - 1, states, states, mask)
     assert value.tolist() == [[4.0, 8.0, 12.0], [2.0, 4.0, 6.0]]
+
+
+def test_ordered_summaries_of_trajectories_together_are_averages_of_each():
+    env = CartPoleEnv(4, seed=2)
+    batch = first_trajectories(env.rollout(30, break_when_any_done=False))
+    for function in (waypoints(3), autocorrelation(1, 2)):
+        statistics = SummaryStatistics(moments, function, duration)
+        each = SummaryStatistics(function)(batch)["summary"]
+        together = statistics.together(batch)
+        torch.testing.assert_close(together[8:-1], each.mean(0))
+        torch.testing.assert_close(together[:8], SummaryStatistics(moments).together(batch))
+        torch.testing.assert_close(statistics.together(batch.flip(0))[8:-1], each.mean(0))
+
+
+def test_a_summary_says_what_it_depends_on():
+    shown = repr(SummaryStatistics(moments, autocorrelation(1, 4), waypoints(2), angles=[0]))
+    assert shown == (
+        "SummaryStatistics(moments, autocorrelation(1, 4), waypoints(2), angles=(0,), "
+        "'observation', 'action' -> 'summary')"
+    )
+
+
+def test_parameters_are_handed_on_under_their_own_key():
+    env = CartPoleEnv(3)
+    batch = env.rollout(5, break_when_any_done=False).set("physics", torch.rand(3, 5, 2))
+    found = SummaryStatistics(moments, theta_key="physics")(batch)
+    assert torch.equal(found["physics"], batch["physics"][:, 0])
+    assert "theta" not in found
 
 
 def test_waypoints_must_be_some():

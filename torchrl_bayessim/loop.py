@@ -9,9 +9,7 @@ Each round (BayesSim, arXiv:1906.01728, fig. 1, made iterative):
 4. the randomizer draws from it, and the learner improves the policy from the batches of step 2
    and from new ones.
 
-Summaries depend on the policy. So each parameter vector is simulated under every policy that made
-real data, as many trajectories each as the robot ran, and the network sees one summary per policy
-side by side. Recorded logs are simulated by replaying their actions.
+How step 2 makes simulations that compare with the real data is told in :mod:`.evidence`.
 """
 
 from __future__ import annotations
@@ -30,26 +28,29 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
 from . import checkpoint
 from .errors import message
+from .evidence import Evidence, EvidenceSimulator
 from .inference.fit import FitReport
 from .inference.physics_posterior import PhysicsPosterior
 from .inference.refinement import PosteriorRefinement
 from .randomness import isolated, seed_from
 from .robots import RealSystem, comparable
-from .simulate import ReplayActions, collect_summaries, make_collector, next_batch
+from .simulate import next_batch
 from .sources import Defensive
 from .summaries import SummaryStatistics
-from .trajectories import concatenate, first_trajectories
+from .trajectories import concatenate
 from .transforms.domain_randomizer import DomainRandomizer
 
 
 class Learner(Protocol):
-    """What the loop asks of an agent: a policy, and a way to improve it from batches."""
+    """What the loop asks of an agent: a policy, and a way to improve it from batches.
+
+    If it has ``settings``, a dictionary of plain values, a checkpoint of others is refused.
+    """
 
     policy: TensorDictModuleBase
 
@@ -109,7 +110,7 @@ class SimToRealLoop:
         episodes: Real episodes per round.
         updates: Learner updates per round from batches drawn under the new posterior.
         shared_batches: How many of the batches simulated for inference also feed the learner.
-        defensive: Probability of a prior draw while training, so that an overconfident posterior
+        prior_share: Probability of a prior draw while training, so that an overconfident posterior
             cannot starve it.
         rounds: Rounds planned.
         seed: Same seed, same rounds.
@@ -138,7 +139,7 @@ class SimToRealLoop:
         episodes: int = 8,
         updates: int = 16,
         shared_batches: int = 4,
-        defensive: float = 0.1,
+        prior_share: float = 0.1,
         rounds: int = 3,
         seed: int = 0,
         checkpoint_file: str | Path | None = None,
@@ -161,20 +162,30 @@ class SimToRealLoop:
         self.settings |= {
             "updates": updates,
             "shared_batches": shared_batches,
-            "defensive": defensive,
-            "simulations": refinement.simulations,
-            "prior": repr(refinement.prior),
+            "prior_share": prior_share,
             "seed": seed,
+            "statistics": repr(statistics),
         }
-        self.env, self.learner, self.robot = env, learner, robot
+        learning: dict[str, Any] = getattr(learner, "settings", {})
+        for part, settings in {"refinement": refinement.settings, "learner": learning}.items():
+            self.settings |= {f"{part}.{name}": value for name, value in settings.items()}
+        self.learner, self.robot = learner, robot
         self.refinement, self.statistics, self.randomizer = refinement, statistics, randomizer
         self.horizon, self.episodes, self.rounds = horizon, episodes, rounds
         self.updates, self.shared_batches = updates, shared_batches
-        self.defensive, self.seed, self.progress = defensive, seed, progress
+        self.prior_share, self.seed, self.progress = prior_share, seed, progress
         self.checkpoint_file = None if checkpoint_file is None else Path(checkpoint_file)
         self.checkpoint_every = checkpoint_every
         self._state: dict[str, Any] = {"round": 0, "frames": 0, "evidence": []} | _FRESH
-        self._collector: Collector | None = None
+        self._simulator = EvidenceSimulator(
+            env,
+            learner.policy,
+            statistics,
+            randomizer,
+            horizon=horizon,
+            keep=shared_batches,
+            progress=progress,
+        )
 
     @property
     def planned_frames(self) -> int:
@@ -182,7 +193,7 @@ class SimToRealLoop:
         rows = self.settings["environments"]
         shared = 0
         if not self.robot.recorded:
-            simulated = -(-self.settings["simulations"] * self.episodes // rows)
+            simulated = -(-self.refinement.simulations * self.episodes // rows)
             shared = min(self.shared_batches, simulated)
         return self.rounds * (shared + self.updates) * rows * self.horizon
 
@@ -195,9 +206,7 @@ class SimToRealLoop:
                 self._state |= {"round": self._state["round"] + 1} | _FRESH
                 self._keep()
         finally:
-            if self._collector is not None:
-                self._collector.shutdown(close_env=False)
-                self._collector = None
+            self._simulator.close()
 
     # One round, in steps after each of which the state is kept.
 
@@ -209,7 +218,7 @@ class SimToRealLoop:
         state: dict[str, Any] = self._state
         posterior = self.refinement.posterior
         assert posterior is not None  # _infer has refined it
-        self.randomizer.source = Defensive(posterior, self.refinement.prior, self.defensive)
+        self.randomizer.source = Defensive(posterior, self.refinement.prior, self.prior_share)
         while state["update"] < self.updates:
             self._step(self._train)
         return Round(
@@ -236,8 +245,8 @@ class SimToRealLoop:
         real = self.robot.rollouts(policy, episodes=self.episodes, key=key)
         if not self.robot.recorded:
             real = comparable(real, horizon=self.horizon)
-        evidence: list[dict[str, Any]] = [] if self.robot.recorded else state["evidence"]
-        new = {
+        evidence: list[Evidence] = [] if self.robot.recorded else state["evidence"]
+        new: Evidence = {
             "policy": dict(copy.deepcopy(policy).state_dict()),
             "episodes": len(real),
             "summary": self.statistics.together(real),
@@ -251,18 +260,13 @@ class SimToRealLoop:
         shared: list[TensorDictBase] = []
 
         def simulate(theta: Tensor) -> Tensor:
-            parts = []
-            for index, entry in enumerate(evidence):
-                where = (*key, "evidence", index)
-                if self.robot.recorded:
-                    parts.append(self._replay(_unflatten(state["real"]), theta, where))
-                elif index < len(evidence) - 1:
-                    parts.append(self._repeat(entry, theta, where))
-                else:
-                    part, batches = self._simulate(entry, theta, where)
-                    parts.append(part)
-                    shared.extend(batches)
-            return torch.cat(parts, -1)
+            if self.robot.recorded:
+                return self._simulator.replay(
+                    _unflatten(state["real"]), theta, key=(*key, "evidence", 0)
+                )
+            summary, batches = self._simulator.policies(evidence, theta, key=(*key, "evidence"))
+            shared.extend(batches)
+            return summary
 
         observed = torch.cat([entry["summary"] for entry in evidence], -1)
         report = self.refinement.refine(simulate, observed, key=key)
@@ -275,7 +279,7 @@ class SimToRealLoop:
         first = state["update"]
         last = min(first + self.checkpoint_every, self.updates)
         key = (self.seed, "round", state["round"], "train", first)
-        collector = self._collect()
+        collector = self._simulator.collector
         with isolated(*key, "reset"):
             collector.set_seed(seed_from(*key, "env") % 2**31)
             collector.reset()
@@ -295,86 +299,6 @@ class SimToRealLoop:
         state["frames"] += batch.numel()
         entry = {"frames": float(state["frames"]), "return": ended_return(batch), **reported}
         state["curve"] = [*state["curve"], entry]
-
-    # Simulation: under the present policy, under an earlier one, or replaying logs.
-
-    def _collect(self) -> Collector:
-        if self._collector is None:
-            # a new collector resets the environments: an episode that a resumed run has on top
-            begun = self.randomizer.get_extra_state()
-            self._collector = make_collector(self.env, self.learner.policy, steps=self.horizon)
-            self.randomizer.set_extra_state(begun)
-        return self._collector
-
-    def _simulate(
-        self, entry: Mapping[str, Any], theta: Tensor, key: tuple[int | str, ...]
-    ) -> tuple[Tensor, list[TensorDictBase]]:
-        return collect_summaries(
-            self._collect(),
-            self.statistics,
-            self.randomizer,
-            theta,
-            trajectories=entry["episodes"],
-            key=key,
-            keep=self.shared_batches,
-            progress=self.progress,
-        )
-
-    def _repeat(
-        self, entry: Mapping[str, Any], theta: Tensor, key: tuple[int | str, ...]
-    ) -> Tensor:
-        policy = copy.deepcopy(self.learner.policy)
-        policy.load_state_dict(entry["policy"])
-        return self._apart(policy, theta, trajectories=entry["episodes"], key=key)
-
-    def _replay(self, real: TensorDictBase, theta: Tensor, key: tuple[int | str, ...]) -> Tensor:
-        """Environment i replays the actions of log i mod n, and is cut where that log ends."""
-        steps, rows = real.shape[1], self.settings["environments"]
-        if rows % len(real):
-            raise ValueError(
-                message(
-                    f"environments in multiples of the {len(real)} logs, whose actions they replay",
-                    rows,
-                    hint=f"{-(-rows // len(real)) * len(real)} environments",
-                )
-            )
-        cut = real.get("mask")[torch.arange(rows) % len(real)]
-
-        def prepare(batch: TensorDictBase) -> TensorDictBase:
-            batch = first_trajectories(batch.reshape(-1, steps))
-            return batch.set("mask", batch.get("mask") & cut)
-
-        policy = ReplayActions(real.get("action"))
-        return self._apart(
-            policy, theta, steps=steps, prepare=prepare, trajectories=len(real), key=key
-        )
-
-    def _apart(
-        self,
-        policy: TensorDictModuleBase,
-        theta: Tensor,
-        *,
-        trajectories: int,
-        key: tuple[int | str, ...],
-        steps: int | None = None,
-        prepare: Callable[[TensorDictBase], TensorDictBase] = first_trajectories,
-    ) -> Tensor:
-        """Simulate with a policy that is not the learner's present one."""
-        collector = make_collector(self.env, policy, steps=steps or self.horizon)
-        try:
-            summaries, _ = collect_summaries(
-                collector,
-                self.statistics,
-                self.randomizer,
-                theta,
-                trajectories=trajectories,
-                key=key,
-                prepare=prepare,
-                progress=self.progress,
-            )
-        finally:
-            collector.shutdown(close_env=False)
-        return summaries
 
     # Keeping work.
 

@@ -79,18 +79,18 @@ def names_of(source: object) -> tuple[str, ...] | None:
 
 
 class Defensive:
-    """A source mixed with the prior: ``(1 - weight) q(θ) + weight p(θ)``.
+    """A source mixed with the prior: ``(1 - w) q(θ) + w p(θ)``.
 
     However overconfident ``q`` is, training still meets the whole prior, and the importance
-    weights ``p / mixture`` stay below ``1 / weight`` (Hesterberg 1995, defensive mixtures).
+    weights ``p / mixture`` stay below ``1 / w`` (Hesterberg 1995, defensive mixtures).
 
     Args:
         source: The distribution to defend against, q.
         prior: What it is mixed with, p.
-        weight: The probability of a draw from the prior, between 0 and 1.
+        prior_share: The probability w of a draw from the prior, between 0 and 1.
 
     Raises:
-        ValueError: ``weight`` is not a probability, or the two name other parameters.
+        ValueError: ``prior_share`` is not a probability, or the two name other parameters.
 
     Example:
         >>> near, wide = Empirical(torch.zeros(1, 1)), Empirical(torch.ones(1, 1))
@@ -98,20 +98,20 @@ class Defensive:
         0.09...
     """
 
-    def __init__(self, source: Source, prior: Source, weight: float) -> None:
-        if not 0 <= weight <= 1:
-            raise ValueError(message("a probability of a prior draw in [0, 1]", weight))
+    def __init__(self, source: Source, prior: Source, prior_share: float) -> None:
+        if not 0 <= prior_share <= 1:
+            raise ValueError(message("a probability of a prior draw in [0, 1]", prior_share))
         names = [names_of(source), names_of(prior)]
         if None not in names and names[0] != names[1]:
             raise ValueError(message(f"a prior over {names[0]}, as the source", names[1]))
-        self.source, self.prior, self.weight = source, prior, weight
+        self.source, self.prior, self.prior_share = source, prior, prior_share
         self.names = names[0] or names[1]
 
     def sample(self, shape: torch.Size, *, generator: torch.Generator) -> Tensor:
         """Return independent draws from the mixture, shape ``(*shape, D)``."""
         count = torch.Size(shape).numel()
         key = int(torch.randint(2**62, (), generator=generator))
-        from_prior = torch.rand(count, generator=generator) < self.weight
+        from_prior = torch.rand(count, generator=generator) < self.prior_share
         theta = draw(self.source, count, key=(key, "source"))
         theta[from_prior] = draw(self.prior, count, key=(key, "prior"))[from_prior]
         return theta.reshape(*shape, -1)
@@ -119,7 +119,7 @@ class Defensive:
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the mixture's log-density, shape ``(*)``; both parts must have one."""
         parts: list[Any] = [self.source, self.prior]
-        weights = torch.tensor([1 - self.weight, self.weight]).log()
+        weights = torch.tensor([1 - self.prior_share, self.prior_share]).log()
         terms = [p.log_prob(value) + w for p, w in zip(parts, weights, strict=True)]
         return torch.logaddexp(*terms)
 

@@ -130,7 +130,7 @@ def autocorrelation(*lags: int) -> Summary:
             parts.append(_mean(product, both) / power.clamp_min(1e-20))
         return torch.cat(parts, -1)
 
-    return summary
+    return _ordered(summary, f"autocorrelation({', '.join(map(str, lags))})")
 
 
 def waypoints(count: int) -> Summary:
@@ -150,6 +150,13 @@ def waypoints(count: int) -> Summary:
         index = index.unsqueeze(-1).expand(*index.shape, next_state.shape[-1])
         return next_state.gather(-2, index).flatten(-2)
 
+    return _ordered(summary, f"waypoints({count})")
+
+
+def _ordered(summary: Summary, name: str) -> Summary:
+    """Name a summary whose value depends on the order of the steps, and say that it does."""
+    setattr(summary, "__qualname__", name)  # noqa: B010 (a function's attributes have no types)
+    setattr(summary, "ordered", True)  # noqa: B010
     return summary
 
 
@@ -197,11 +204,13 @@ class SummaryStatistics(TensorDictModuleBase):
     the parameters of each row's first trajectory.
 
     Args:
-        *functions: Summaries; their values are concatenated.
+        *functions: Summaries; their values are concatenated. One whose value depends on the order
+            of the steps has an attribute ``ordered = True``: see :meth:`together`.
         angles: Columns of the observation that are raw angles in radians.
         observation_key: Key of the state.
         action_key: Key of the action; one-hot actions are encoded by :func:`encode_actions`.
         out_key: Key of the summary.
+        theta_key: Key of the parameters, which are handed on where present.
 
     Raises:
         ValueError: For no functions; in a call, for discrete actions given as indices.
@@ -220,12 +229,14 @@ class SummaryStatistics(TensorDictModuleBase):
         observation_key: NestedKey = "observation",
         action_key: NestedKey = "action",
         out_key: NestedKey = "summary",
+        theta_key: NestedKey = "theta",
     ) -> None:
         super().__init__()
         if not functions:
             raise ValueError(message("at least one summary", "none", hint="cross_correlation"))
         self.functions, self.angles = functions, tuple(angles)
         self.observation_key, self.action_key = observation_key, action_key
+        self.theta_key = theta_key
         self.in_keys = [observation_key, action_key, _next(observation_key), ("next", "done")]
         self.out_keys = [out_key]
 
@@ -235,8 +246,9 @@ class SummaryStatistics(TensorDictModuleBase):
         The steps of all n count as those of one long trajectory (each difference lies within its
         own), so regressions and correlations use all the data at once. A posterior learned on
         such summaries is that of the n trajectories together; multiplying n single-trajectory
-        posteriors would multiply the network's errors too. Lags and waypoints run on from one
-        trajectory into the next.
+        posteriors would multiply the network's errors too. Summaries that depend on the order of
+        the steps (``ordered``: autocorrelations, waypoints) are those of each trajectory, averaged
+        over the n.
 
         Example:
             >>> from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
@@ -252,13 +264,29 @@ class SummaryStatistics(TensorDictModuleBase):
             values = trajectories.get(key).flatten(-3, -2)
             rows = order.unsqueeze(-1).expand(values.shape)
             steps.set(key, values.gather(-2, rows))
-        return self(steps).get(self.out_keys[0])
+        pooled = self._values(steps, ordered=False)
+        each = self._values(trajectories, ordered=True)
+        parts = [
+            each[i].mean(-2) if _is_ordered(function) else pooled[i]
+            for i, function in enumerate(self.functions)
+        ]
+        return torch.cat(parts, -1)
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``{"summary": (*, L)[, "theta": (*, D)]}`` of trajectories ``[*, T]``."""
         if "mask" not in tensordict.keys():  # noqa: SIM118 (TensorDict iterates rows)
             tensordict = first_trajectories(tensordict)
+        values = self._values(tensordict)
+        out = TensorDict({}, batch_size=tensordict.batch_size[:-1])
+        out.set(self.out_keys[0], torch.cat(list(values.values()), -1))
+        theta = tensordict.get(self.theta_key, None)
+        return out if theta is None else out.set(self.theta_key, theta[..., 0, :])
+
+    def _values(
+        self, tensordict: TensorDictBase, *, ordered: bool | None = None
+    ) -> dict[int, Tensor]:
+        """Return the values of all functions, or of those that are ``ordered`` or not."""
         state, mask = tensordict.get(self.observation_key), tensordict.get("mask")
         action = tensordict.get(self.action_key)
         if action.ndim == mask.ndim or (action.shape[-1] == 1 and not action.is_floating_point()):
@@ -272,11 +300,20 @@ class SummaryStatistics(TensorDictModuleBase):
         action = encode_actions(action)
         # angles are unwrapped through their wrapped differences, once, for every summary
         tau = differences(state, tensordict.get(_next(self.observation_key)), self.angles)
-        parts = [function(state, action, state + tau, mask) for function in self.functions]
-        out = TensorDict({}, batch_size=tensordict.batch_size[:-1])
-        out.set(self.out_keys[0], torch.cat(parts, -1))
-        theta = tensordict.get("theta", None)
-        return out if theta is None else out.set("theta", theta[..., 0, :])
+        return {
+            i: function(state, action, state + tau, mask)
+            for i, function in enumerate(self.functions)
+            if ordered in (None, _is_ordered(function))
+        }
+
+    def __repr__(self) -> str:
+        names = [getattr(f, "__qualname__", type(f).__name__) for f in self.functions]
+        keys = f"{self.observation_key!r}, {self.action_key!r} -> {self.out_keys[0]!r}"
+        return f"SummaryStatistics({', '.join(names)}, angles={self.angles}, {keys})"
+
+
+def _is_ordered(function: Summary) -> bool:
+    return getattr(function, "ordered", False)
 
 
 def _next(key: NestedKey) -> NestedKey:

@@ -50,7 +50,7 @@ class PosteriorTrainerHook(TrainerHookBase):
             environments in other processes need.
         interval: Batches from one refinement to the next; the first is one.
         episodes: Real episodes per refinement, independent given the parameters.
-        defensive: Probability of a prior draw while training.
+        prior_share: Probability of a prior draw while training.
         seed: Same seed, same real episodes and fits.
 
     Raises:
@@ -104,7 +104,7 @@ class PosteriorTrainerHook(TrainerHookBase):
         randomizer: DomainRandomizer | None = None,
         interval: int = 8,
         episodes: int = 1,
-        defensive: float = 0.1,
+        prior_share: float = 0.1,
         seed: int = 0,
     ) -> None:
         if interval < 2:
@@ -117,7 +117,7 @@ class PosteriorTrainerHook(TrainerHookBase):
             )
         self.robot, self.refinement, self.statistics = robot, refinement, statistics
         self.randomizer, self.interval, self.episodes = randomizer, interval, episodes
-        self.defensive, self.seed = defensive, seed
+        self.prior_share, self.seed = prior_share, seed
         self.report: FitReport | None = None
         self._batches = 0  # processed so far
         self._collector: BaseCollector | None = None
@@ -204,7 +204,7 @@ class PosteriorTrainerHook(TrainerHookBase):
             self._draw_from(self.refinement.proposal())
             self._noted = {k: v.clone() for k, v in self._policy().state_dict().items()}
         elif posterior is not None:
-            self._draw_from(Defensive(posterior, self.refinement.prior, self.defensive))
+            self._draw_from(Defensive(posterior, self.refinement.prior, self.prior_share))
 
     def _draw_from(self, source: Source) -> None:
         if self.randomizer is not None:

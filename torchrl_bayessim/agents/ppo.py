@@ -62,6 +62,7 @@ class PPO:
         policy: Reads the observation keys, writes ``action`` and ``action_log_prob``; hand it to a
             collector. It samples unless `set_exploration_type` says otherwise.
         critic: Reads observation and critic keys, writes ``state_value``.
+        settings: What updates depend on; a loop refuses the checkpoint of other ones.
 
     Example:
         >>> from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
@@ -98,6 +99,23 @@ class PPO:
         self.learning_rate, self.final_learning_rate = learning_rate, final_learning_rate
         self.epochs, self.minibatch_size = epochs, minibatch_size
         self.max_grad_norm = max_grad_norm
+        self.settings: dict[str, Any] = {
+            "seed": seed,
+            "observation_keys": list(observation_keys),
+            "critic_keys": list(critic_keys),
+            "hidden": list(hidden),
+            "gamma": gamma,
+            "gae_lambda": gae_lambda,
+            "clip": clip,
+            "entropy_coeff": entropy_coeff,
+            "critic_coeff": critic_coeff,
+            "learning_rate": learning_rate,
+            "final_learning_rate": final_learning_rate,
+            "epochs": epochs,
+            "minibatch_size": minibatch_size,
+            "max_grad_norm": max_grad_norm,
+            "reward_scale": reward_scale,
+        }
         seen: list[Any] = list(observation_keys)
         known: list[Any] = [*seen, *critic_keys]
         with isolated(seed, "ppo parameters"):

@@ -22,7 +22,8 @@ from torch import Tensor
 from ..errors import message
 from ..randomness import seed_from
 from ..sources import Defensive, draw
-from .fit import FitReport, fit
+from .ensemble import PosteriorMaker, learn
+from .fit import FitReport
 from .misspecification import doubts
 from .physics_posterior import PhysicsPosterior
 from .posterior import MixtureDensityPosterior
@@ -41,7 +42,7 @@ class PosteriorRefinement:
             average, which is less sure where they disagree.
         make_posterior: ``(prior, summary size)`` to a fresh network; a default one if omitted.
         margin: Widening of the box around the last posterior, see :func:`.proposals.focus`.
-        proposal_prior: Share of prior draws where importance weights are used; bounds them by its
+        prior_share: Share of prior draws where importance weights are used; bounds them by its
             inverse.
         seed: Same seed, same refinements.
         fit_options: Passed to :func:`.fit.fit`.
@@ -65,9 +66,9 @@ class PosteriorRefinement:
         *,
         simulations: int = 1024,
         networks: int = 2,
-        make_posterior: Callable[[Prior, int], MixtureDensityPosterior] | None = None,
+        make_posterior: PosteriorMaker | None = None,
         margin: float = 1.0,
-        proposal_prior: float = 0.25,
+        prior_share: float = 0.25,
         seed: int = 0,
         fit_options: Mapping[str, Any] | None = None,
     ) -> None:
@@ -77,9 +78,23 @@ class PosteriorRefinement:
             )
         self.prior, self.simulations, self.networks = prior, simulations, networks
         self.make_posterior = make_posterior or MixtureDensityPosterior
-        self.margin, self.proposal_prior, self.seed = margin, proposal_prior, seed
+        self.margin, self.prior_share, self.seed = margin, prior_share, seed
         self.fit_options = dict(fit_options or {})
         self.posterior: PhysicsPosterior | None = None
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What refinements depend on besides their data; a loop refuses a checkpoint of others."""
+        return {
+            "prior": repr(self.prior),
+            "simulations": self.simulations,
+            "networks": self.networks,
+            "make_posterior": getattr(self.make_posterior, "__qualname__", ""),
+            "margin": self.margin,
+            "prior_share": self.prior_share,
+            "seed": self.seed,
+            "fit_options": repr({k: v for k, v in self.fit_options.items() if k != "progress"}),
+        }
 
     def refine(
         self, simulate: Callable[[Tensor], Tensor], observed: Tensor, *, key: tuple[int | str, ...]
@@ -123,16 +138,17 @@ class PosteriorRefinement:
         if proposal is not local:
             counted = [(proposal, len(theta))]
             pairs["weight"] = importance_weights(theta, self.prior, counted)
-        reports, members = [], []
-        for member in range(self.networks):
-            network = self.make_posterior(local, summary.shape[-1])
-            seed = seed_from(self.seed, *key, "fit", member)
-            reports.append(fit(network, pairs, **{"seed": seed, **self.fit_options}))
-            members.append(network.condition(observed).mixture)
-        self.posterior = PhysicsPosterior(_average(members), local)
+        self.posterior, report = learn(
+            pairs,
+            local,
+            observed,
+            make_posterior=self.make_posterior,
+            seeds=[seed_from(self.seed, *key, "fit", i) for i in range(self.networks)],
+            fit_options=self.fit_options,
+        )
         for doubt in doubts(summary, observed, self.posterior):
             warnings.warn(doubt, stacklevel=2)
-        return reports[0]
+        return report
 
     def _proposal(self) -> tuple[Prior, Any]:
         """Return the prior that the network is to know, and what is simulated."""
@@ -141,7 +157,7 @@ class PosteriorRefinement:
         if isinstance(self.prior, BoxPrior):
             local = focus(self.prior, self.posterior, margin=self.margin, seed=self.seed)
             return local, local
-        return self.prior, Defensive(self.posterior, self.prior, self.proposal_prior)
+        return self.prior, Defensive(self.posterior, self.prior, self.prior_share)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the posterior as tensors and plain values."""
@@ -187,14 +203,3 @@ def _check_finite(observed: Tensor) -> None:
                 hint="drop the trajectories that diverged, or repair their logs",
             )
         )
-
-
-def _average(members: list[TruncatedGaussianMixture]) -> TruncatedGaussianMixture:
-    """Return the mixture of mixtures, all with the same weight."""
-    return TruncatedGaussianMixture(
-        torch.cat([member.logits for member in members], -1),
-        torch.cat([member.loc for member in members], -2),
-        torch.cat([member.scale_tril for member in members], -3),
-        members[0].box,
-        diagonal=members[0].diagonal,
-    )

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from ..errors import message
 from ..sources import Defensive, draw
-from .fit import FitReport, fit
+from .ensemble import learn
+from .fit import FitReport
 from .physics_posterior import PhysicsPosterior
 from .posterior import MixtureDensityPosterior
 from .priors import Prior
@@ -61,7 +62,7 @@ def sequential(
     rounds: int,
     simulations: int,
     correction: Correction = "importance",
-    defensive: float = 0.2,
+    prior_share: float = 0.2,
     make_posterior: Callable[[int], MixtureDensityPosterior] | None = None,
     seed: int = 0,
     **fit_options: Any,
@@ -76,7 +77,7 @@ def sequential(
         simulations: Simulations per round.
         correction: See :mod:`.proposals`. ``"importance"`` and ``"truncated"`` train on the pairs
             of all rounds; ``"analytic"`` on the last round's.
-        defensive: Share of the draws from the prior that is kept in every proposal.
+        prior_share: Share of the draws from the prior that is kept in every proposal.
         make_posterior: Summary size to a fresh network; a default one if omitted.
         seed: Same seed, same rounds (if the simulator is deterministic).
         **fit_options: Passed to :func:`.fit.fit`.
@@ -96,19 +97,24 @@ def sequential(
         if correction == "analytic":
             history = history[-1:]
         pairs = _pairs(history, prior, weighted=correction != "analytic")
-        size = pairs["summary"].shape[-1]
-        network = (
-            MixtureDensityPosterior(prior, size, seed=seed)
-            if make_posterior is None
-            else make_posterior(size)
+        posterior, report = learn(
+            pairs,
+            prior,
+            observed,
+            make_posterior=lambda prior, size: (
+                MixtureDensityPosterior(prior, size, seed=seed)
+                if make_posterior is None
+                else make_posterior(size)
+            ),
+            seeds=[seed],
+            fit_options=fit_options,
         )
-        report = fit(network, pairs, seed=seed, **fit_options)
-        posterior, repaired = network.condition(observed), 0
+        repaired = 0
         if correction == "analytic" and index > 0:
             posterior, repaired = analytic_correction(posterior, proposal)
         effective = effective_sample_size(pairs["weight"])
         yield SequentialRound(index, posterior, report, effective, repaired)
-        proposal = _next_proposal(posterior, prior, correction, defensive)
+        proposal = _next_proposal(posterior, prior, correction, prior_share)
 
 
 def _pairs(
@@ -124,10 +130,10 @@ def _pairs(
 
 
 def _next_proposal(
-    posterior: PhysicsPosterior, prior: Prior, correction: Correction, weight: float
+    posterior: PhysicsPosterior, prior: Prior, correction: Correction, prior_share: float
 ) -> Any:
     if correction == "analytic":
         return gaussian_proposal(posterior)
     if correction == "truncated":
-        return Defensive(HighestDensityPrior(prior, posterior), prior, weight)
-    return Defensive(posterior, prior, weight)
+        return Defensive(HighestDensityPrior(prior, posterior), prior, prior_share)
+    return Defensive(posterior, prior, prior_share)

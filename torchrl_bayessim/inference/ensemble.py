@@ -1,0 +1,65 @@
+"""A posterior from pairs: networks fitted to them, conditioned on the real data, and averaged.
+
+One network is sure of what it cannot know where pairs are few. Several, fitted on other splits of
+the same pairs, disagree there, and their average is less sure (deep ensembles, Lakshminarayanan,
+Pritzel & Blundell, 2017, arXiv:1612.01474).
+"""
+
+from __future__ import annotations
+
+__all__ = ["PosteriorMaker", "average", "learn"]
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from .fit import FitReport, fit
+from .physics_posterior import PhysicsPosterior
+from .posterior import MixtureDensityPosterior
+from .priors import Prior
+from .truncation import TruncatedGaussianMixture
+
+PosteriorMaker = Callable[[Prior, int], MixtureDensityPosterior]
+
+
+def learn(
+    pairs: TensorDictBase,
+    prior: Prior,
+    observed: Tensor,
+    *,
+    make_posterior: PosteriorMaker,
+    seeds: Sequence[int],
+    fit_options: Mapping[str, Any],
+) -> tuple[PhysicsPosterior, FitReport]:
+    """Return the posterior given ``observed``, and what the first fit did.
+
+    Args:
+        pairs: ``{"theta", "summary"[, "weight"]}``, batch size ``[N]``.
+        prior: What the networks are to know.
+        observed: Summaries of the real trajectories, shape ``(L,)`` or ``(n, L)``.
+        make_posterior: Prior and summary size to a fresh network.
+        seeds: Of the fits, one for each network.
+        fit_options: Passed to :func:`.fit.fit`; a seed there takes the place of those above.
+    """
+    reports, members = [], []
+    for seed in seeds:
+        network = make_posterior(prior, pairs["summary"].shape[-1])
+        reports.append(fit(network, pairs, **{"seed": seed, **fit_options}))
+        members.append(network.condition(observed).mixture)
+    return PhysicsPosterior(average(members), prior), reports[0]
+
+
+def average(members: Sequence[TruncatedGaussianMixture]) -> TruncatedGaussianMixture:
+    """Return the mixture of mixtures, all with the same weight."""
+    if len(members) == 1:
+        return members[0]
+    return TruncatedGaussianMixture(
+        torch.cat([member.logits for member in members], -1),
+        torch.cat([member.loc for member in members], -2),
+        torch.cat([member.scale_tril for member in members], -3),
+        members[0].box,
+        diagonal=members[0].diagonal,
+    )
