@@ -1,0 +1,165 @@
+"""Logs are read from every format alike, and malformed ones end in one message."""
+
+import importlib.util
+import json
+
+import numpy as np
+import pytest
+import torch
+from tensordict import NonTensorData, TensorDict
+
+from torchrl_bayessim.logs.read import read_logs, read_records
+
+ROWS = "t,q,qd,tau,note\n0.00,0.1,0.0,1.0,7\n0.01,0.1,0.1,1.0,7\n0.02,0.1,0.2,0.5,7\n"
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(text, name="log.csv"):
+        path = tmp_path / name
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return path
+
+    return write
+
+
+def test_csv(write, pendulum):
+    path = write("\ufeff" + ROWS)
+    (log,) = read_logs(path, pendulum)
+    assert log.name == "log.csv"
+    assert log.first_row == 0
+    torch.testing.assert_close(log.qvel[:, 0], torch.tensor([0.0, 0.1, 0.2]).double())
+    torch.testing.assert_close(log.ctrl[:, 0], torch.tensor([1.0, 1.0, 0.5]).double())
+    assert log.qpos.dtype == torch.float64
+    assert log.measured.tolist() == [True, True]
+    assert log.velocity_gain.tolist() == [0.0]
+
+
+def test_a_folder_is_read_in_order(write, tmp_path, pendulum):
+    write(ROWS, "b.csv")
+    write(ROWS, "a.csv")
+    write("no log", "README.md")
+    assert [record.name for record in read_records(tmp_path, pendulum)] == ["a.csv", "b.csv"]
+    files = [tmp_path / "b.csv", str(tmp_path / "a.csv")]
+    assert [record.name for record in read_records(files, pendulum)] == ["b.csv", "a.csv"]
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", "a header and rows"),
+        ("t,q,qd,tau\n", "a header and rows"),
+        (ROWS.replace("qd", "q", 1), "each column once in log.csv, got 'q'"),
+        (ROWS.replace("qd", "dq", 1), "a column of log.csv, got 'qd'"),
+        (ROWS[:-12], "5 cells in row 2 of log.csv"),
+        (ROWS.replace("0.5", "half"), "a number in row 2, column 'tau' of log.csv, got 'half'"),
+        (ROWS.replace(",", ";"), "a column of log.csv, got 't'"),
+        ("t,q,qd,tau,größe\n".encode("latin-1"), "UTF-8"),
+        (ROWS.encode("utf-16"), "UTF-8"),
+        (ROWS.replace("0.02,", "0.005,"), "increasing time in log.csv, got '0.005 s after"),
+        (ROWS.replace("0.1,", "nan,"), "that can be used"),
+    ],
+)
+def test_malformed_csv_is_named(write, pendulum, text, match):
+    with pytest.raises(ValueError, match=match):
+        read_logs(write(text), pendulum)
+
+
+def test_missing_logs_are_named(tmp_path, write, pendulum):
+    with pytest.raises(ValueError, match="a folder or file of logs"):
+        read_logs(tmp_path / "none", pendulum)
+    with pytest.raises(ValueError, match="a folder with CSV or Parquet files"):
+        read_logs(tmp_path, pendulum)
+    with pytest.raises(ValueError, match=r"a \.csv or \.parquet file"):
+        read_logs(write(ROWS, "log.txt"), pendulum)
+    with pytest.raises(ValueError, match="a file that exists"):
+        read_logs([tmp_path / "none.csv"], pendulum)
+    with pytest.raises(ValueError, match="at least one log"):
+        read_logs([], pendulum)
+
+
+def test_rows_that_are_not_finite_split_a_log(write, pendulum):
+    rows = [f"{0.01 * i:.2f},{0.1 * i},0,{'' if i == 4 else 1},7" for i in range(10)]
+    logs = read_logs(write("t,q,qd,tau,note\n" + "\n".join(rows)), pendulum)
+    assert [log.name for log in logs] == ["log.csv rows 0 to 3", "log.csv rows 5 to 9"]
+    assert [log.first_row for log in logs] == [0, 5]
+
+
+def test_a_tensordict_is_cut_where_an_episode_ends(tmp_path, pendulum):
+    done = torch.zeros(2, 6, 1, dtype=torch.bool)
+    done[0, 3] = True
+    data = TensorDict(
+        {
+            "t": 0.01 * torch.arange(6.0).expand(2, 6),
+            "q": torch.randn(2, 6, 1),
+            "qd": torch.randn(2, 6, 1),
+            "tau": torch.randn(2, 6, 1),
+            "next": {"done": done},
+        },
+        batch_size=[2, 6],
+    )
+    logs = read_logs(data, pendulum)
+    assert [len(log) for log in logs] == [4, 2, 6]
+    torch.testing.assert_close(logs[1].qpos, data["q"][0, 4:].double())
+    data.memmap(tmp_path / "saved")
+    saved = read_logs(tmp_path / "saved", pendulum)
+    assert [log.name for log in saved] == ["saved[0]", "saved[1]", "saved[2]"]
+    torch.testing.assert_close(saved[2].ctrl, logs[2].ctrl)
+
+
+def test_arrays_may_be_named_as_in_mujoco_and_need_no_time(box):
+    pose = torch.tensor([0.0, 0, 1, 1, 0, 0, 0]).expand(7, 7)
+    data = TensorDict({"state": {"qpos": pose, "qvel": torch.zeros(7, 6)}}, batch_size=[7])
+    (log,) = read_logs(data, box)
+    torch.testing.assert_close(log.qpos, pose.double())
+    torch.testing.assert_close(log.time, 0.01 * torch.arange(7).double())
+    assert log.ctrl.shape == (7, 0)
+
+
+def test_a_saved_tensordict_cannot_run_code(tmp_path, pendulum):
+    data = TensorDict({"q": torch.zeros(3), "code": NonTensorData(print, batch_size=[3])}, [3])
+    data.memmap(tmp_path / "saved")
+    with pytest.raises(ValueError, match="a tensordict without pickles"):
+        read_logs(tmp_path / "saved", pendulum)
+    with pytest.raises(ValueError, match="batch size"):
+        read_logs(TensorDict({"q": torch.zeros(3)}, []), pendulum)
+
+
+def test_a_folder_that_only_looks_like_a_tensordict(tmp_path, pendulum):
+    (tmp_path / "meta.json").write_text(json.dumps({"name": "robot"}))
+    with pytest.raises(ValueError, match="a tensordict without pickles"):
+        read_logs(tmp_path, pendulum)
+
+
+def test_parquet(tmp_path, pendulum):
+    pyarrow = pytest.importorskip("pyarrow", reason="Parquet needs pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    table = {"t": [0.0, 0.01, 0.02], "q": [1, 2, 3], "qd": [0.0, 0.1, 0.2], "tau": [1.0, 1.0, None]}
+    parquet.write_table(pyarrow.table(table), tmp_path / "log.parquet")
+    (record,) = read_records(tmp_path, pendulum)
+    np.testing.assert_array_equal(record.qpos[:, 0], [1, 2, 3])
+    assert np.isnan(record.ctrl[2, 0])
+    parquet.write_table(pyarrow.table({**table, "q": ["a", "b", "c"]}), tmp_path / "log.parquet")
+    with pytest.raises(ValueError, match="numbers in Parquet"):
+        read_records(tmp_path, pendulum)
+    (tmp_path / "log.parquet").write_text("no parquet")
+    with pytest.raises(ValueError, match="numbers in Parquet"):
+        read_records(tmp_path, pendulum)
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("pyarrow") is not None, reason="only where pyarrow is missing"
+)
+def test_parquet_without_pyarrow(write, pendulum):
+    with pytest.raises(ImportError, match=r"torchrl_bayessim\[recipes\]"):
+        read_records(write("", "log.parquet"), pendulum)
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("minari") is not None, reason="only where Minari is missing"
+)
+def test_minari_without_minari(tmp_path, pendulum):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "metadata.json").write_text("{}")
+    with pytest.raises(ImportError, match=r"torchrl_bayessim\[minari\]"):
+        read_records(tmp_path, pendulum)

@@ -1,0 +1,90 @@
+"""Logs from wherever they are kept: a folder or files, in the formats of `tables`."""
+
+from __future__ import annotations
+
+__all__ = ["read_logs", "read_records"]
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from tensordict import TensorDictBase
+
+from ..errors import message
+from .log import Log
+from .record import Record, record_of
+from .resampling import resample
+from .system import System
+from .tables import Table, dataset_tables, read_csv, read_parquet, tensordict_tables
+
+Source = str | Path | Sequence[str | Path] | TensorDictBase
+_READERS = {".csv": read_csv, ".parquet": read_parquet}
+
+
+def read_records(source: Source, system: System) -> list[Record]:
+    """Return trajectories as they were logged.
+
+    Args:
+        source: A folder with CSV or Parquet files, a Minari dataset's folder, the folder of a
+            TensorDict saved by TorchRL, a list of files, or a tensordict of batch size ``(*, T)``.
+        system: The robot; its columns say what is read.
+
+    Raises:
+        ValueError: There is no log, a file is malformed, or a column is missing.
+        ImportError: The format needs a package that is not installed.
+    """
+    if isinstance(source, TensorDictBase):
+        tables = tensordict_tables(source, system)
+    elif isinstance(source, str | Path):
+        tables = _tables(Path(source), system)
+    else:
+        tables = [_file_table(Path(path), system) for path in source]
+    if not tables:
+        raise ValueError(message("at least one log", "none"))
+    return [record_of(table, system) for table in tables]
+
+
+def read_logs(source: Source, system: System) -> list[Log]:
+    """Return trajectories at the system's control step; for the arguments see `read_records`.
+
+    Rows that are not finite are left out, and gaps split a trajectory. Nothing else is checked:
+    that is for `sanity`.
+
+    Example:
+        >>> from torchrl_bayessim.envs.tasks.catalogue import known_task
+        >>> from tensordict import TensorDict
+        >>> system = System(task=known_task("InvertedPendulum-v5"))
+        >>> state = {"qpos": torch.zeros(8, 2), "qvel": torch.zeros(8, 2)}
+        >>> data = TensorDict({**state, "action": torch.zeros(8, 1)}, batch_size=[8])
+        >>> read_logs(data, system)[0].qpos.shape
+        torch.Size([8, 2])
+
+    Raises:
+        ValueError: A time does not increase, a file has no usable rows, or as `read_records`.
+        ImportError: As `read_records`.
+    """
+    return [log for record in read_records(source, system) for log in resample(record, system)]
+
+
+def _tables(path: Path, system: System) -> list[Table]:
+    if path.is_file():
+        return [_file_table(path, system)]
+    if not path.is_dir():
+        raise ValueError(message("a folder or file of logs", str(path)))
+    if (path / "data" / "metadata.json").is_file():
+        return dataset_tables(path, system)
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in _READERS)
+    if files:
+        return [_file_table(file, system) for file in files]
+    if (path / "meta.json").is_file():
+        return tensordict_tables(path, system)
+    expected = "a folder with CSV or Parquet files, a Minari dataset or a saved TensorDict"
+    raise ValueError(message(expected, str(path)))
+
+
+def _file_table(path: Path, system: System) -> Table:
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise ValueError(message("a .csv or .parquet file", str(path)))
+    if not path.is_file():
+        raise ValueError(message("a file that exists", str(path)))
+    return reader(path, system.columns.used())

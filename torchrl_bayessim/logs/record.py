@@ -1,0 +1,82 @@
+"""One trajectory as it was logged: at its own times, in the simulator's quantities."""
+
+from __future__ import annotations
+
+__all__ = ["Record", "record_of"]
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import message
+from .columns import actuator_names, joint_names
+from .system import System
+from .tables import Table
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Record:
+    """Rows of a log; what was not measured is NaN throughout.
+
+    Attributes:
+        name: The file's name.
+        time: Seconds, shape ``(T,)``.
+        qpos: Shape ``(T, nq)``; quaternions are normalised and do not change sign between rows.
+        qvel: Shape ``(T, nv)``.
+        ctrl: The action held from each row on, shape ``(T, nu)``.
+    """
+
+    name: str
+    time: Array
+    qpos: Array
+    qvel: Array
+    ctrl: Array
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+def record_of(table: Table, system: System) -> Record:
+    """Return a table's columns in the simulator's quantities.
+
+    Raises:
+        ValueError: A quaternion is far from a unit quaternion.
+    """
+    model, columns = system.task.model, system.columns
+    length = len(next(iter(table.columns.values())))
+    qpos = np.full((length, model.nq), np.nan)
+    qvel = np.full((length, model.nv), np.nan)
+    ctrl = np.full((length, model.nu), np.nan)
+    for j, joint in enumerate(joint_names(model)):
+        for i, name in enumerate(columns.qpos.get(joint, ())):
+            qpos[:, model.jnt_qposadr[j] + i] = table.columns[name]
+        for i, name in enumerate(columns.qvel.get(joint, ())):
+            qvel[:, model.jnt_dofadr[j] + i] = table.columns[name]
+        if len(columns.qpos.get(joint, ())) > 1:
+            place = slice(qpos_end := model.jnt_qposadr[j] + len(columns.qpos[joint]) - 4, None)
+            quaternions = qpos[:, place][:, :4]
+            qpos[:, qpos_end : qpos_end + 4] = _continuous(quaternions, table.name, joint)
+    for i, actuator in enumerate(actuator_names(model)):
+        ctrl[:, i] = table.columns[columns.ctrl[actuator]]
+    if columns.time is None:
+        time = system.control_dt * np.arange(length, dtype=np.float64)
+    else:
+        time = table.columns[columns.time].copy()
+    return Record(name=table.name, time=time, qpos=qpos, qvel=qvel, ctrl=ctrl)
+
+
+def _continuous(quaternions: Array, file: str, joint: str) -> Array:
+    """Return unit quaternions, each in the half space of the one before."""
+    norm = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    wrong = np.flatnonzero(np.abs(norm[:, 0] - 1) > 0.1)
+    if len(wrong):
+        expected = f"unit quaternions w, x, y, z of {joint!r} in {file}"
+        got = f"norm {norm[wrong[0], 0]:.3g} in row {wrong[0]}"
+        raise ValueError(message(expected, got))
+    unit = quaternions / norm
+    turns = np.nan_to_num((unit[1:] * unit[:-1]).sum(1), nan=1.0)
+    signs = np.cumprod(np.concatenate([[1.0], np.where(turns < 0, -1.0, 1.0)]))
+    return unit * signs[:, None]
