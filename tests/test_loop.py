@@ -8,10 +8,19 @@ import sys
 import time
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
-from torchrl.envs import Compose, GymEnv, RewardSum, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    GymEnv,
+    GymWrapper,
+    RewardSum,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
 
 from torchrl_bayessim import checkpoint
 from torchrl_bayessim.agents.ppo import PPO
@@ -475,6 +484,37 @@ def test_if_all_simulations_diverge_the_robots_work_is_kept(tmp_path):
     )
     assert again.resume()
     next(iter(again))
+
+
+class Diverging(gymnasium.Wrapper):
+    """CartPole whose observations become NaN while ``broken`` is set."""
+
+    broken = False
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        return observation * (np.nan if Diverging.broken else 1), *rest
+
+
+def test_nan_from_a_simulator_is_named_and_loses_nothing(tmp_path, monkeypatch):
+    file, asked = tmp_path / "state.pt", []
+    randomizer = DomainRandomizer(PRIOR)
+    simulator = GymWrapper(Diverging(gymnasium.make("CartPole-v1")))
+    env = TransformedEnv(simulator, Compose(physics(), randomizer, StepCounter(50), RewardSum()))
+    robot = Bringing(lambda real: asked.append(real) or real)
+    loop = make_loop(env, randomizer, robot=robot, simulations=6, updates=1, checkpoint_file=file)
+    turns = iter(loop)
+    first = next(turns)
+    monkeypatch.setattr(Diverging, "broken", True)
+    with pytest.raises(SimulationError, match=r"batch of finite observations.*simulation diverge"):
+        next(turns)
+    assert len(asked) == 2
+    monkeypatch.setattr(Diverging, "broken", False)
+    (second,) = loop  # goes on in the second round, without asking the robot again
+    assert len(asked) == 2
+    assert second.index == 1
+    assert second.frames > first.frames
+    assert len(loop.state_dict()["loop"]["evidence"]) == 2
 
 
 # Keeping work.

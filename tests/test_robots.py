@@ -16,12 +16,13 @@ from torchrl.envs import (
 from torchrl_bayessim.agents.ppo import PPO
 from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.physics.attributes import AttributePhysics
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
 from torchrl_bayessim.physics.state import StatePhysics
 from torchrl_bayessim.robots import RecordedLogs, SurrogateRobot
 from torchrl_bayessim.trajectories import pad
-from torchrl_bayessim.transforms import ApplyPhysics
+from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
 
 HIDDEN = 0.7314159
 
@@ -179,3 +180,26 @@ def test_empty_logs_are_refused():
         RecordedLogs(logs.set("mask", logs["mask"] & torch.tensor([[True], [False]])))
     with pytest.raises(ValueError, match=r"trajectories \[n, T\].*got \(3,\)"):
         RecordedLogs(logs[0])
+
+
+@pytest.mark.parametrize("steps", [0, -1])
+def test_a_robot_takes_at_least_one_step(steps):
+    with pytest.raises(ValueError, match=f"max_steps to be positive, got {steps}"):
+        SurrogateRobot(batched(), [HIDDEN], max_steps=steps)
+
+
+def test_a_robot_does_at_least_one_episode():
+    robot = SurrogateRobot(batched(), [HIDDEN], max_steps=5)
+    with pytest.raises(ValueError, match="episodes to be positive, got 0"):
+        robot.rollouts(None, episodes=0, key=(0,))
+
+
+@pytest.mark.parametrize("nested", [True, False])
+def test_a_robot_does_not_draw_its_own_parameters(nested):
+    randomizer = DomainRandomizer(BoxPrior({"length": (0.2, 1.5)}))
+    env = batched() if nested else batched(3, randomizer)
+    if nested:
+        env = TransformedEnv(env, randomizer, auto_unwrap=False)
+        env = TransformedEnv(env, StepCounter(), auto_unwrap=False)
+    with pytest.raises(ValueError, match=r"the robot alone sets.*'a DomainRandomizer among"):
+        SurrogateRobot(env, [HIDDEN], max_steps=5)

@@ -368,3 +368,12 @@ def test_no_draw_is_needed_where_no_environment_resets():
     td = env.reset()
     td["_reset"] = torch.zeros(2, 1, dtype=torch.bool)
     assert torch.equal(env.reset(td)["theta"], td["theta"])
+
+
+def test_a_source_that_cannot_be_sampled_is_refused_at_once():
+    with pytest.raises(TypeError, match=r"a source with sample\(shape\), got 'NoneType'"):
+        DomainRandomizer(None)
+    randomizer = DomainRandomizer(Uniform())
+    with pytest.raises(TypeError, match=r"a source with sample.*Try: a prior, a posterior"):
+        randomizer.source = None
+    assert isinstance(randomizer.source, Uniform)  # the old one stays

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from .errors import message
-from .sources import Empirical, Grid, Source, draw
+from .sources import Empirical, Grid, Source, check_source, draw
 
 _ROWS = 64
 _TABLES = 4096  # of 64 rows: 1,024 environments may lie 256 episodes apart before one is redrawn
@@ -32,6 +32,7 @@ class EpisodeDraws:
             (Ramos et al. 2019 train on 100 domains.)
 
     Raises:
+        TypeError: ``source`` cannot be sampled.
         ValueError: ``pool`` is not positive, or is given for a `Grid`.
 
     Example:
@@ -42,6 +43,8 @@ class EpisodeDraws:
     """
 
     def __init__(self, source: Source | Grid, *, seed: int = 0, pool: int | None = None) -> None:
+        if not isinstance(source, Grid):
+            check_source(source)
         if pool is not None and (pool < 1 or isinstance(source, Grid)):
             raise ValueError(message("pool > 0 of a source that samples", pool))
         if pool is not None and not isinstance(source, Grid):

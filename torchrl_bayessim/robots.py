@@ -56,8 +56,9 @@ class SurrogateRobot:
             other, and nothing else is reported.
 
     Raises:
-        ValueError: For a measured entry that is not observed; in a call, for a policy that reads
-            what is not measured.
+        ValueError: For a measured entry that is not observed, no steps, or an environment that
+            draws its own parameters; in a call, for no episodes, or a policy that reads what is not
+            measured.
 
     Example:
         >>> from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
@@ -80,6 +81,9 @@ class SurrogateRobot:
         max_steps: int,
         measured: Sequence[NestedKey] = ("observation",),
     ) -> None:
+        if max_steps < 1:
+            raise ValueError(message("max_steps to be positive", max_steps))
+        _check_not_randomized(env)
         self.max_steps, self.measured = max_steps, list(measured)
         theta = torch.as_tensor(theta, dtype=torch.float32)
         self._randomizer = DomainRandomizer(Grid(theta[None]))
@@ -100,6 +104,8 @@ class SurrogateRobot:
         key: tuple[int | str, ...],
     ) -> TensorDictBase:
         """Return trajectories ``[episodes, T]`` with a ``"mask"``, made by ``policy``."""
+        if episodes < 1:
+            raise ValueError(message("episodes to be positive", episodes))
         for entry in getattr(policy, "in_keys", ()):
             if entry in self._observed and entry not in self.measured:
                 raise ValueError(
@@ -119,6 +125,19 @@ class SurrogateRobot:
         following = [*self.measured, "reward", "done", "terminated", "truncated"]
         reported = [*self.measured, "action", "mask", *(_next(entry) for entry in following)]
         return real.select(*reported, strict=False)
+
+
+def _check_not_randomized(env: EnvBase) -> None:
+    while isinstance(env, TransformedEnv):
+        if any(isinstance(module, DomainRandomizer) for module in env.transform.modules()):
+            raise ValueError(
+                message(
+                    "an environment whose parameters the robot alone sets",
+                    "a DomainRandomizer among its transforms",
+                    hint="TransformedEnv(simulator, ApplyPhysics(physics))",
+                )
+            )
+        env = env.base_env
 
 
 def _next(entry: NestedKey) -> NestedKey:

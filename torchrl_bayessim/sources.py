@@ -8,7 +8,7 @@ https://arxiv.org/abs/1906.01728) draws from the posterior instead.
 
 from __future__ import annotations
 
-__all__ = ["Defensive", "Empirical", "Grid", "Source", "draw", "names_of"]
+__all__ = ["Defensive", "Empirical", "Grid", "Source", "check_source", "draw", "names_of"]
 
 import inspect
 from typing import Any, Protocol
@@ -44,6 +44,7 @@ def draw(source: Source, count: int, *, key: tuple[int | str, ...]) -> Tensor:
         Finite values, shape ``(N, D)``.
 
     Raises:
+        TypeError: ``source`` cannot be sampled.
         ValueError: The source gave another shape, or values that are not finite.
 
     Example:
@@ -51,6 +52,7 @@ def draw(source: Source, count: int, *, key: tuple[int | str, ...]) -> Tensor:
         >>> bool((draw(source, 3, key=(0, "a")) == draw(source, 3, key=(0, "a"))).all())
         True
     """
+    check_source(source)
     shape = torch.Size((count,))
     with torch.no_grad():
         if "generator" in inspect.signature(source.sample).parameters:
@@ -70,6 +72,22 @@ def draw(source: Source, count: int, *, key: tuple[int | str, ...]) -> Tensor:
         bad = theta[~theta.isfinite().all(-1)][0].tolist()
         raise ValueError(message(f"finite draws from {type(source).__name__}.sample", bad))
     return theta.to("cpu", torch.float32)
+
+
+def check_source(source: object) -> None:
+    """Refuse what cannot be sampled.
+
+    Raises:
+        TypeError: ``source`` has no method ``sample``.
+    """
+    if not callable(getattr(source, "sample", None)):
+        raise TypeError(
+            message(
+                "a source with sample(shape)",
+                type(source).__name__,
+                hint="a prior, a posterior, a torch distribution, or randomizer.pin(theta)",
+            )
+        )
 
 
 def names_of(source: object) -> tuple[str, ...] | None:

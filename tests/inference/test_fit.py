@@ -342,3 +342,35 @@ def test_epochs_and_batches_are_positive(options):
     data = TensorDict({"theta": theta, "summary": theta}, [8])
     with pytest.raises(ValueError, match="positive epochs and batch_size"):
         fit(MixtureDensityPosterior(prior, 1), data, progress=False, **options)
+
+
+def test_without_pairs_there_is_nothing_to_fit_either():
+    empty = linear_gaussian(4)[:0]
+    with pytest.raises(ValueError, match="at least one pair, got 'none'"):
+        usable_pairs(empty)
+    with pytest.raises(ValueError, match="at least one pair, got 'none'"):
+        short_fit(posterior(), empty)
+
+
+@pytest.mark.parametrize("key", ["theta", "summary"])
+def test_pairs_have_both_entries(key):
+    with pytest.raises(ValueError, match=f"pairs with an entry, got '{key}'. Available: "):
+        short_fit(posterior(), linear_gaussian(50).exclude(key))
+
+
+def test_a_fit_reads_the_keys_that_the_posterior_was_made_with():
+    data = linear_gaussian(60)
+    other = data.clone().rename_key_("summary", "x").rename_key_("theta", ("physics", "mass"))
+    expected = short_fit(posterior(), data)
+    report = short_fit(posterior(in_key="x", out_key=("physics", "mass")), other)
+    assert report.train == expected.train
+    assert report.validation == expected.validation
+
+
+def test_a_length_scale_is_selected_under_the_posterior_s_own_keys():
+    data = linear_gaussian(60)
+    net = posterior(features="fourier")
+    renamed = posterior(features="fourier", in_key="x")
+    options = {"factors": (0.5, 1.0), "epochs": 2, "progress": False}
+    expected = select_lengthscale(net, data, **options)
+    assert select_lengthscale(renamed, data.rename_key_("summary", "x"), **options) == expected

@@ -195,7 +195,7 @@ def test_priors_show_their_names_and_numbers():
     [
         ({}, [], "at least one named parameter, got 'an empty prior'"),
         ([("a", (0, 1)), ("a", (1, 2))], [], "every parameter once, got 'a twice'"),
-        ({"a": (2, 1)}, [], r"low < high for 'a', got \(2, 1\). Try: \(1, 2\)"),
+        ({"a": (2, 1)}, [], r"low < high for 'a', got \(2.0, 1.0\). Try: \(1.0, 2.0\)"),
         ({"a": (1, 1)}, [], "low < high for 'a'"),
         ({"a": (0, math.inf)}, [], "finite bounds for 'a' .* Try: .*GaussianPrior"),
         ({"a": (math.nan, 1)}, [], "finite bounds for 'a'"),
@@ -240,3 +240,28 @@ def test_the_wrong_number_of_parameters_is_refused(prior, method):
     match = rf"one column for each of {', '.join(prior.names)}, got \(5, 7\)"
     with pytest.raises(ValueError, match=match):
         getattr(prior, method)(torch.zeros(5, 7))
+
+
+@pytest.mark.parametrize("bounds", [1.0, (1.0,), (1.0, 2.0, 3.0), ("low", "high"), None])
+def test_bounds_are_two_numbers(bounds):
+    with pytest.raises(ValueError, match=r"a name with \(low, high\), two numbers, got \('a', "):
+        BoxPrior({"a": bounds})
+
+
+def test_moments_are_two_numbers():
+    with pytest.raises(ValueError, match=r"a name with \(mean, standard deviation\), two numbers"):
+        GaussianPrior({"a": 1.0})
+    with pytest.raises(ValueError, match="a name with"):
+        GaussianPrior([1.0])
+
+
+def test_logarithmic_parameters_are_listed():
+    with pytest.raises(TypeError, match=r"log= to be a list of names, got 'mass'.*log=\['mass'\]"):
+        BoxPrior({"mass": (1.0, 2.0)}, log="mass")
+
+
+def test_bounds_differ_in_the_precision_that_parameters_have():
+    with pytest.raises(ValueError, match="bounds of 'mass' that differ in float32"):
+        BoxPrior({"mass": (1.0, 1.0 + 1e-9)})
+    narrow = BoxPrior({"mass": (1.0, 1.0 + 1e-6)})
+    assert narrow.contains(narrow.sample((100,), generator=generator(0))).all()

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -46,13 +46,25 @@ class FitReport:
         return min(self.validation)
 
 
-def usable_pairs(data: TensorDictBase) -> tuple[TensorDictBase, int]:
+def usable_pairs(
+    data: TensorDictBase,
+    *,
+    theta_key: NestedKey = "theta",
+    summary_key: NestedKey = "summary",
+) -> tuple[TensorDictBase, int]:
     """Return the pairs whose parameters and summaries are finite, and how many were dropped.
 
     Raises:
+        ValueError: If there are no pairs, or one of the two entries is missing.
         SimulationError: If none is left.
     """
-    good = data["theta"].isfinite().all(-1) & data["summary"].isfinite().all(-1)
+    for key in (theta_key, summary_key):
+        if data.get(key, None) is None:
+            found = sorted(map(str, data.keys(include_nested=True)))
+            raise ValueError(message("pairs with an entry", str(key), available=found))
+    if not data.batch_size.numel():
+        raise ValueError(message("at least one pair", "none", hint="simulate some"))
+    good = data[theta_key].isfinite().all(-1) & data[summary_key].isfinite().all(-1)
     dropped = int((~good).sum())
     if dropped == good.numel():
         raise SimulationError(
@@ -81,6 +93,8 @@ def fit(
 ) -> FitReport:
     """Maximise the posterior's log-density over pairs ``{"theta", "summary"[, "weight"]}``.
 
+    If the posterior was made with an ``in_key`` or ``out_key``, the pairs' entries are those.
+
     Adam with a cosine learning rate; after every epoch the loss on held-out pairs is computed, and
     the parameters of the best epoch are kept. Pairs that are not finite are dropped and counted.
 
@@ -106,7 +120,8 @@ def fit(
         raise ValueError(message("a validation_fraction between 0 and 1", validation_fraction))
     if epochs < 1 or batch_size < 1:
         raise ValueError(message("positive epochs and batch_size", (epochs, batch_size)))
-    pairs, dropped = usable_pairs(data.select("theta", "summary", "weight", strict=False))
+    entries = {"theta_key": posterior.theta_key, "summary_key": posterior.summary_key}
+    pairs, dropped = usable_pairs(data.select(*entries.values(), "weight", strict=False), **entries)
     if dropped:
         warnings.warn(
             f"{dropped} of {len(data)} simulations are not finite: left out", stacklevel=2
@@ -116,7 +131,7 @@ def fit(
     held_out = min(max(1, round(validation_fraction * len(pairs))), len(pairs) - 2)
     validation, train = pairs[order[:held_out]], pairs[order[held_out:]].contiguous()
     if rescale:
-        posterior.network.standardize_inputs(train.get("summary"))
+        posterior.network.standardize_inputs(train.get(posterior.summary_key))
     trace = _descend(
         posterior,
         train,
@@ -136,7 +151,8 @@ def _check_pairs(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> N
     if len(pairs) < 4:
         raise ValueError(message("at least 4 usable pairs", len(pairs), hint="simulate more"))
     expected = (len(posterior.prior.names), len(posterior.network.shift))
-    got = (pairs["theta"].shape[-1], pairs["summary"].shape[-1])
+    theta, summary = pairs[posterior.theta_key], pairs[posterior.summary_key]
+    got = (theta.shape[-1], summary.shape[-1])
     if got != expected:
         raise ValueError(message("pairs with (D, L) of the posterior, " + str(expected), got))
     weight = pairs.get("weight", None)
@@ -145,13 +161,13 @@ def _check_pairs(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> N
         if not good.all() or not weight.any():
             text = f"{int((~good).sum())} that are not, sum {weight.sum().item():.3g}"
             raise ValueError(message("finite weights of 0 or more, some positive", text))
-    outside = ~posterior.prior.contains(pairs["theta"])
+    outside = ~posterior.prior.contains(theta)
     if outside.any():
         row = int(outside.nonzero()[0])
         raise ValueError(
             message(
                 f"parameters inside the prior {posterior.prior!r}",
-                f"{int(outside.sum())} outside it, the first {pairs['theta'][row].tolist()}",
+                f"{int(outside.sum())} outside it, the first {theta[row].tolist()}",
                 hint="the prior that the parameters were drawn from",
             )
         )
@@ -171,6 +187,7 @@ def _descend(
     progress: bool,
 ) -> tuple[list[float], list[float]]:
     loss_module = PosteriorLoss(posterior)
+    loss_module.set_keys(theta=posterior.theta_key)
     optimizer = torch.optim.AdamW(posterior.parameters(), lr=lr, weight_decay=weight_decay)
     batches = math.ceil(len(train) / batch_size)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs * batches)
@@ -236,10 +253,11 @@ def select_lengthscale(
     features = network.features
     if not isinstance(features, FourierFeatures):
         raise TypeError(message("a posterior over FourierFeatures", type(features).__name__))
-    pairs, _ = usable_pairs(data)
-    network.standardize_inputs(pairs["summary"])
+    key = posterior.summary_key
+    pairs, _ = usable_pairs(data, theta_key=posterior.theta_key, summary_key=key)
+    network.standardize_inputs(pairs[key])
     some = torch.randperm(len(pairs), generator=generator(seed, "median"))[:500]
-    median = torch.pdist(network.scaled(pairs["summary"][some])).median().item()
+    median = torch.pdist(network.scaled(pairs[key][some])).median().item()
     scores = {}
     for factor in factors:
         trial = copy.deepcopy(posterior)

@@ -110,7 +110,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
             ),
         ]
         super().__init__(*modules)  # pyright: ignore[reportCallIssue, reportArgumentType]
-        self.prior = prior
+        self.prior, self.summary_key, self.theta_key = prior, in_key, out_key
 
     @classmethod
     def paper_mode(

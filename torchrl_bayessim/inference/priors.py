@@ -13,12 +13,13 @@ A prior is a torch :class:`~torch.distributions.Distribution` with event shape `
 
 from __future__ import annotations
 
-__all__ = ["BoxPrior", "GaussianPrior", "Prior", "Standardization"]
+__all__ = ["BoxPrior", "GaussianPrior", "Prior"]
 
 import math
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Size, Tensor
 from torch.distributions import Distribution, constraints
@@ -30,51 +31,27 @@ from torch.distributions.transforms import (
 )
 
 from ..errors import message
+from .standardization import Standardization
 
 Pairs = Mapping[str, tuple[float, float]] | Sequence[tuple[str, tuple[float, float]]]
 
 
-def _as_list(pairs: Pairs) -> list[tuple[str, tuple[float, float]]]:
-    return list(pairs.items()) if isinstance(pairs, Mapping) else list(pairs)
-
-
-class Standardization(Transform):
-    r"""The bijection :math:`z \mapsto \theta`: :math:`u = m + S z`, then exp where logarithmic.
-
-    Args:
-        mean: :math:`m`, shape ``(D,)``.
-        scale_tril: :math:`S`, lower triangular, shape ``(D, D)``.
-        log: Which parameters are logarithmic, boolean, shape ``(D,)``.
-    """
-
-    domain = constraints.real_vector
-    codomain = constraints.real_vector
-    bijective = True
-
-    def __init__(self, mean: Tensor, scale_tril: Tensor, log: Tensor) -> None:
-        super().__init__()
-        self.mean, self.scale_tril, self.log = mean, scale_tril, log
-
-    def _call(self, x: Tensor) -> Tensor:
-        u = self.mean.to(x.dtype) + x @ self.scale_tril.to(x.dtype).mT
-        return torch.where(self.log, u.exp(), u) if self.log.any() else u
-
-    def _inverse(self, y: Tensor) -> Tensor:
-        u = torch.where(self.log, self._log(y), y) if self.log.any() else y
-        centred = (u - self.mean.to(y.dtype)).unsqueeze(-1)
-        scale = self.scale_tril.to(y.dtype)
-        return torch.linalg.solve_triangular(scale, centred, upper=False).squeeze(-1)
-
-    def log_abs_det_jacobian(self, x: Tensor, y: Tensor) -> Tensor:
-        r"""Return :math:`\log |\partial\theta / \partial z|`, shape ``(*)``."""
-        volume = self.scale_tril.diagonal().log().sum().to(x.dtype)
-        if not self.log.any():
-            return volume.expand(x.shape[:-1])
-        return volume + self._log(y).sum(-1)
-
-    def _log(self, y: Tensor) -> Tensor:
-        """Return the logarithm of logarithmic parameters, finite below 0, and 0 for others."""
-        return torch.where(self.log, y.clamp_min(torch.finfo(y.dtype).tiny), 1.0).log()
+def _as_list(pairs: Pairs, what: str) -> list[tuple[str, tuple[float, float]]]:
+    """Return ``(name, (a, b))`` of numbers, where ``what`` says what a and b are."""
+    found = []
+    for item in pairs.items() if isinstance(pairs, Mapping) else pairs:
+        try:
+            name, (a, b) = item
+            found.append((name, (float(a), float(b))))
+        except (TypeError, ValueError):
+            raise ValueError(message(f"a name with {what}, two numbers", item)) from None
+    if not found:
+        raise ValueError(message("at least one named parameter", "an empty prior"))
+    names = [name for name, _ in found]
+    duplicates = sorted({name for name in names if names.count(name) > 1})
+    if duplicates:
+        raise ValueError(message("every parameter once", f"{duplicates[0]} twice"))
+    return found
 
 
 class Prior(Distribution):
@@ -140,7 +117,9 @@ class BoxPrior(Prior):
 
     Raises:
         ValueError: For no parameters, duplicate names, reversed, equal, infinite or NaN bounds,
-            and a logarithmic parameter whose lower bound is not positive.
+            bounds that float32 cannot tell apart, and a logarithmic parameter whose lower bound is
+            not positive.
+        TypeError: ``log`` is a string and not a list of names.
 
     Example:
         >>> prior = BoxPrior({"mass": (2.0, 6.0), "damping": (0.01, 1.0)}, log=["damping"],
@@ -159,11 +138,11 @@ class BoxPrior(Prior):
         log: Sequence[str] = (),
         units: Mapping[str, str] | None = None,
     ) -> None:
-        pairs = _as_list(bounds)
+        pairs = _as_list(bounds, "(low, high)")
         names = [name for name, _ in pairs]
         _check_bounds(pairs, names, log)
-        self.low = torch.tensor([float(low) for _, (low, _) in pairs])
-        self.high = torch.tensor([float(high) for _, (_, high) in pairs])
+        self.low = torch.tensor([low for _, (low, _) in pairs], dtype=torch.float32)
+        self.high = torch.tensor([high for _, (_, high) in pairs], dtype=torch.float32)
         self.log = torch.tensor([name in log for name in names])
         low, high = self._u(self.low.double()), self._u(self.high.double())
         half = (high - low) / 2
@@ -252,9 +231,8 @@ class BoxPrior(Prior):
 def _check_bounds(
     pairs: Sequence[tuple[str, tuple[float, float]]], names: Sequence[str], log: Sequence[str]
 ) -> None:
-    if not pairs:
-        raise ValueError(message("at least one named parameter", "an empty prior"))
-    _check_unique(names)
+    if isinstance(log, str):
+        raise TypeError(message("log= to be a list of names", log, hint=f"log=[{log!r}]"))
     for name, (low, high) in pairs:
         if not (math.isfinite(low) and math.isfinite(high)):
             raise ValueError(
@@ -268,6 +246,14 @@ def _check_bounds(
             raise ValueError(
                 message(f"low < high for {name!r}", (low, high), hint=f"({high}, {low})")
             )
+        if not np.float32(low) < np.float32(high):
+            raise ValueError(
+                message(
+                    f"bounds of {name!r} that differ in float32, which parameters are kept in",
+                    (low, high),
+                    hint="wider bounds, or leave a known parameter out of the prior",
+                )
+            )
         if name in log and low <= 0:
             raise ValueError(
                 message(
@@ -279,12 +265,6 @@ def _check_bounds(
     for name in log:
         if name not in names:
             raise ValueError(message("log= to name declared parameters", name, available=names))
-
-
-def _check_unique(names: Sequence[str]) -> None:
-    duplicates = sorted({name for name in names if list(names).count(name) > 1})
-    if duplicates:
-        raise ValueError(message("every parameter once", f"{duplicates[0]} twice"))
 
 
 class GaussianPrior(Prior):
@@ -312,18 +292,15 @@ class GaussianPrior(Prior):
         correlation: Tensor | None = None,
         units: Mapping[str, str] | None = None,
     ) -> None:
-        pairs = _as_list(moments)
+        pairs = _as_list(moments, "(mean, standard deviation)")
         names = [name for name, _ in pairs]
-        if not pairs:
-            raise ValueError(message("at least one named parameter", "an empty prior"))
-        _check_unique(names)
         for name, (mean, sd) in pairs:
             if not (math.isfinite(mean) and math.isfinite(sd) and sd > 0):
                 raise ValueError(
                     message(f"a finite mean and a positive deviation for {name!r}", (mean, sd))
                 )
-        mean = torch.tensor([float(m) for _, (m, _) in pairs], dtype=torch.float64)
-        sd = torch.tensor([float(s) for _, (_, s) in pairs], dtype=torch.float64)
+        mean = torch.tensor([m for _, (m, _) in pairs], dtype=torch.float64)
+        sd = torch.tensor([s for _, (_, s) in pairs], dtype=torch.float64)
         self.standardization = Standardization(
             mean,
             sd[:, None] * _correlation_tril(correlation, len(names)),

@@ -38,6 +38,7 @@ class DomainRandomizer(Transform):
 
     Raises:
         PhysicsError: No `ApplyPhysics` before it writes ``key``, or for other parameters.
+        TypeError: The source, now or when assigned, cannot be sampled.
 
     Example:
         >>> from torchrl.envs import Compose, GymEnv, TransformedEnv
