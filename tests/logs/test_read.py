@@ -3,12 +3,15 @@
 import importlib.util
 import json
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 from tensordict import NonTensorData, TensorDict
 
+from torchrl_bayessim.logs.columns import Columns
 from torchrl_bayessim.logs.read import read_logs, read_records
+from torchrl_bayessim.logs.system import System
 
 ROWS = "t,q,qd,tau,note\n0.00,0.1,0.0,1.0,7\n0.01,0.1,0.1,1.0,7\n0.02,0.1,0.2,0.5,7\n"
 
@@ -163,3 +166,39 @@ def test_minari_without_minari(tmp_path, pendulum):
     (tmp_path / "data" / "metadata.json").write_text("{}")
     with pytest.raises(ImportError, match=r"torchrl_bayessim\[minari\]"):
         read_records(tmp_path, pendulum)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning:minari.*")  # of metadata that nobody gave
+def test_minari(tmp_path, monkeypatch, pendulum):
+    minari = pytest.importorskip("minari", reason="needs Minari")
+    pytest.importorskip("h5py")
+    from minari.data_collector import EpisodeBuffer
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    states = np.arange(12.0).reshape(6, 2)
+    buffer = EpisodeBuffer(
+        observations=states,
+        actions=np.arange(5.0)[:, None],
+        rewards=[0.0] * 5,
+        terminations=[False] * 5,
+        truncations=[False] * 4 + [True],
+        infos={"clock": 0.01 * np.arange(6)},
+    )
+    space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    minari.create_dataset_from_buffers(
+        "swing/test-v0",
+        buffer=[buffer, buffer],
+        observation_space=space,
+        action_space=gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float64),
+    )
+    columns = Columns(
+        "infos.clock",
+        {"hinge": ("observations[0]",)},
+        {"hinge": ("observations[1]",)},
+        {"motor": "actions[0]"},
+    )
+    system = System(task=pendulum.task, columns=columns)
+    first, second = read_logs(tmp_path / "swing" / "test-v0", system)
+    assert second.name == "test-v0[1]"
+    torch.testing.assert_close(first.qpos[:, 0], torch.from_numpy(states[:5, 0]))
+    torch.testing.assert_close(first.ctrl[:, 0], torch.arange(5.0).double())

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torchrl_bayessim.logs.record import Record, record_of
 from torchrl_bayessim.logs.resampling import resample
 from torchrl_bayessim.logs.tables import Table
-from torchrl_bayessim.logs.velocity import angular_velocity, velocity
+from torchrl_bayessim.logs.velocity import Windows, angular_velocity, velocity
 
 
 def swing(time, *, speed=True):
@@ -89,8 +89,8 @@ def test_velocities_are_estimated_with_their_gain(pendulum_without_velocity, dt)
 def test_the_window_is_short_where_noise_is_not_the_problem():
     time = 0.01 * np.arange(200)
     rng = np.random.default_rng(0)
-    *_, clean = velocity(time, np.sin(20 * time))
-    *_, noisy = velocity(time, np.sin(2 * time) + 0.01 * rng.normal(size=200))
+    *_, clean = velocity(Windows(time), np.sin(20 * time))
+    *_, noisy = velocity(Windows(time), np.sin(2 * time) + 0.01 * rng.normal(size=200))
     assert clean < noisy
 
 
@@ -118,7 +118,7 @@ def test_rotations_follow_the_motion(box):
         mujoco.mj_differentiatePos(model, difference, 1.0, a, b)
         assert np.abs(difference).max() < 1e-3
     np.testing.assert_allclose(log.qvel, speed[rows], atol=0.03)
-    estimated, gain, _ = angular_velocity(fine_time, fine[:, 3:])
+    estimated, gain, _ = angular_velocity(Windows(fine_time), fine[:, 3:])
     assert np.abs(estimated - speed[:, 3:]).max() < 1e-2
     assert gain > 0
 

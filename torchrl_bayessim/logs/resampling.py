@@ -24,7 +24,7 @@ from .columns import joint_names
 from .log import Log
 from .record import Record
 from .system import System
-from .velocity import angular_velocity, velocity
+from .velocity import Windows, angular_velocity, velocity
 
 Array = NDArray[np.float64]
 _GAP = 5.0  # steps without a row after which a record is split
@@ -123,7 +123,7 @@ def _velocities(
     model, columns = system.task.model, system.columns
     gain = np.zeros(model.nv)
     result = np.nan_to_num(qvel)
-    margin = 0
+    margin, windows = 0, Windows(time)
     for j, joint in enumerate(joint_names(model)):
         if joint in columns.qvel or joint not in columns.qpos:
             continue
@@ -132,12 +132,12 @@ def _velocities(
         q, v = model.jnt_qposadr[j], model.jnt_dofadr[j]
         plain = _ROTATIONS.get(int(model.jnt_type[j]), 1)
         for i in range(plain):
-            result[:, v + i], gain[v + i], half = velocity(time, qpos[:, q + i])
+            result[:, v + i], gain[v + i], half = velocity(windows, qpos[:, q + i])
             margin = max(margin, half)
         if int(model.jnt_type[j]) in _ROTATIONS:
             place = slice(v + plain, v + plain + 3)
             quaternions = qpos[:, q + plain : q + plain + 4]
-            result[:, place], gain[place], half = angular_velocity(time, quaternions)
+            result[:, place], gain[place], half = angular_velocity(windows, quaternions)
             margin = max(margin, half)
     return result, gain, margin
 

@@ -11,7 +11,7 @@ the best.
 
 from __future__ import annotations
 
-__all__ = ["angular_velocity", "velocity"]
+__all__ = ["Windows", "angular_velocity", "velocity"]
 
 from collections.abc import Callable
 
@@ -24,11 +24,43 @@ Rows = NDArray[np.int64]
 _HALF_WIDTHS = (2, 3, 4, 6, 9, 13, 19, 28)
 
 
-def velocity(time: Array, position: Array) -> tuple[Array, float, int]:
-    """Return the velocity, its gain and the half width ``h`` of the window.
+class Windows:
+    """Least squares around every row, set up once for all positions of a record.
 
     Args:
         time: Increasing, shape ``(T,)``, at least 5 rows.
+    """
+
+    def __init__(self, time: Array) -> None:
+        self._time = time
+        self._fits: dict[int, tuple[Rows, Array, Array]] = {}
+
+    @property
+    def half_widths(self) -> list[int]:
+        """Half widths ``h`` that leave at least as many rows outside as inside."""
+        fitting = [h for h in _HALF_WIDTHS if 2 * h + 1 <= len(self._time) // 2]
+        return fitting or [2]
+
+    def fit(self, half: int) -> tuple[Rows, Array, Array]:
+        """Return each row's window, and the weights of the value and of the slope, ``(T, w)``."""
+        if half not in self._fits:
+            count, width = len(self._time), 2 * half + 1
+            first = np.clip(np.arange(count) - half, 0, count - width)
+            rows = first[:, None] + np.arange(width)
+            offset = self._time[rows] - self._time[:, None]
+            scale = np.abs(offset).max(1, keepdims=True)
+            powers = (offset / scale)[..., None] ** np.arange(4)
+            transposed = powers.transpose(0, 2, 1)
+            weights = np.linalg.solve(transposed @ powers, transposed)
+            self._fits[half] = rows, weights[:, 0], weights[:, 1] / scale
+        return self._fits[half]
+
+
+def velocity(windows: Windows, position: Array) -> tuple[Array, float, int]:
+    """Return the velocity, its gain and the half width ``h`` of the window.
+
+    Args:
+        windows: Of the record's times.
         position: Shape ``(T,)``.
 
     Returns:
@@ -37,18 +69,19 @@ def velocity(time: Array, position: Array) -> tuple[Array, float, int]:
 
     Example:
         >>> t = np.arange(50) * 0.01
-        >>> slope, gain, half = velocity(t, np.sin(3 * t))
+        >>> slope, gain, half = velocity(Windows(t), np.sin(3 * t))
         >>> bool(np.abs(slope - 3 * np.cos(3 * t)).max() < 1e-3)
         True
     """
-    return _fitted(time, lambda rows: (position[rows] - position[:, None])[..., None])
+    slope, gain, half = _fitted(windows, lambda rows: position[rows] - position[:, None])
+    return slope, gain, half
 
 
-def angular_velocity(time: Array, quaternion: Array) -> tuple[Array, float, int]:
+def angular_velocity(windows: Windows, quaternion: Array) -> tuple[Array, float, int]:
     """Return angular velocities in the frame of the body, shape ``(T, 3)``; else as `velocity`.
 
     Args:
-        time: Shape ``(T,)``.
+        windows: Of the record's times.
         quaternion: Unit quaternions ``w, x, y, z``, shape ``(T, 4)``.
     """
 
@@ -57,39 +90,23 @@ def angular_velocity(time: Array, quaternion: Array) -> tuple[Array, float, int]
         own, other = (
             Rotation.from_quat(q, scalar_first=True) for q in (own, quaternion[rows.reshape(-1)])
         )
-        return (own.inv() * other).as_rotvec().reshape(*rows.shape, 3)
+        turns = (own.inv() * other).as_rotvec().reshape(*rows.shape, 3)
+        return np.moveaxis(turns, -1, 0)
 
-    return _fitted(time, near)
+    slope, gain, half = _fitted(windows, near)
+    return slope.T, gain, half
 
 
-def _fitted(time: Array, near: Callable[[Rows], Array]) -> tuple[Array, float, int]:
-    """Fit in windows of every width; ``near`` gives what neighbours differ by, ``(T, w, K)``."""
+def _fitted(windows: Windows, near: Callable[[Rows], Array]) -> tuple[Array, float, int]:
+    """Fit in windows of every width; ``near`` gives what neighbours differ by, ``(*, T, w)``."""
     fits = []
-    for half in _HALF_WIDTHS:
-        if 2 * half + 1 > max(5, len(time) // 2):
-            break
-        rows, smooth, slope = _weights(time, half)
+    for half in windows.half_widths:
+        rows, smooth, slope = windows.fit(half)
         differences = near(rows)
-        own = (rows == np.arange(len(time))[:, None]).nonzero()
-        leverage = smooth[own]
-        # the row itself differs from itself by zero: what is fitted there is the residual
-        fitted = np.einsum("tw,twk->tk", smooth, differences)
-        error = np.mean((fitted / (1 - leverage[:, None])) ** 2)
-        fits.append((error, half, np.einsum("tw,twk->tk", slope, differences), slope))
+        leverage = smooth[rows == np.arange(len(rows))[:, None]]
+        # a row differs from itself by zero, so what is fitted there is the residual
+        residual = (smooth * differences).sum(-1) / (1 - leverage)
+        fits.append((np.mean(residual**2), half, (slope * differences).sum(-1), slope))
     best = min(error for error, *_ in fits)
     _, half, result, slope = [fit for fit in fits if fit[0] <= 1.05 * best][-1]
-    gain = float(np.median(np.linalg.norm(slope, axis=1)))
-    return (result[:, 0] if result.shape[1] == 1 else result), gain, half
-
-
-def _weights(time: Array, half: int) -> tuple[Rows, Array, Array]:
-    """Return each row's window, and the weights of the value and of the slope, ``(T, w)``."""
-    width = 2 * half + 1
-    first = np.clip(np.arange(len(time)) - half, 0, len(time) - width)
-    rows = first[:, None] + np.arange(width)
-    offset = time[rows] - time[:, None]
-    scale = np.abs(offset).max(1, keepdims=True)
-    powers = (offset / scale)[..., None] ** np.arange(4)
-    normal = np.einsum("twi,twj->tij", powers, powers)
-    weights = np.linalg.solve(normal, powers.transpose(0, 2, 1))
-    return rows, weights[:, 0], weights[:, 1] / scale
+    return result, float(np.median(np.linalg.norm(slope, axis=1))), half
