@@ -163,3 +163,27 @@ def test_restored_models_are_nominal():
 def test_physics_for_another_number_of_environments_are_refused():
     with pytest.raises(ValueError, match="the physics of 3 environments, got 2"):
         Stepper(model(), 3).use(ModelBatch(model(), 2))
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_threads_refresh_what_one_thread_does(threads):
+    masses = np.linspace(0.5, 2.0, 40)
+    one, several = ModelBatch(model(), 40), ModelBatch(model(), 40, threads=threads)
+    for models in (one, several):
+        for rows in (None, masses > 1.0):  # the second time with other columns
+            models.write("body_mass", (2,), masses, rows)
+            models.refresh(rows)
+            models.write("dof_armature", (1,), 0.1 * masses)
+        models.refresh(np.zeros(40, dtype=bool))  # nobody
+        models.refresh()
+    np.testing.assert_array_equal(several.table, one.table)
+    assert len(np.unique(several.read("body_subtreemass", (1,)))) == 40
+
+
+def test_repeated_physics_keep_their_columns():
+    models = ModelBatch(model(), 2)
+    models.write("body_mass", (1,), np.array([1.0, 2.0]))
+    models.refresh()
+    again = models.repeated(3)
+    again.refresh()
+    np.testing.assert_array_equal(again.table, np.repeat(models.table, 3, axis=0))

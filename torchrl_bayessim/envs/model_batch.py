@@ -11,6 +11,7 @@ from __future__ import annotations
 __all__ = ["ModelBatch"]
 
 import copy
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import mujoco
@@ -47,6 +48,7 @@ _SCALARS = {
     "opt.o_margin": ("opt.gravity", 11),
     "stat.meaninertia": ("stat.center", -4),
 }
+_SHARE = 8  # environments that are worth another thread
 # Where a frame coincides with its body's (or inertial) frame MuJoCo copies it and ignores these.
 _FRAMES = {
     "body_ipos": "body_sameframe",
@@ -76,6 +78,16 @@ def _address(model: mujoco.MjModel, field: str, indices: tuple[int, ...]) -> int
     )
 
 
+class _Scratch:
+    """What one thread refreshes with: a model and data of its own."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.model = copy.copy(model)
+        self.data = mujoco.MjData(self.model)
+        self.columns = np.empty(0, dtype=np.int64)  # addresses of the table's columns
+        self.derived = self.columns  # which columns are derived from others
+
+
 class ModelBatch:
     """The physics of ``num_envs`` environments that share one model.
 
@@ -91,6 +103,7 @@ class ModelBatch:
     Args:
         model: The nominal model. It is never changed; environments start from its values.
         num_envs: The number of environments ``N``.
+        threads: That refresh many environments at once.
 
     Attributes:
         model: The nominal model.
@@ -98,13 +111,13 @@ class ModelBatch:
         table: Values of the overridden entries, shape ``(N, K)``.
     """
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int) -> None:
-        self.model = model
+    def __init__(self, model: mujoco.MjModel, num_envs: int, *, threads: int = 1) -> None:
+        self.model, self.threads = model, threads
         self.num_envs = num_envs
         self.table: NDArray[np.float64] = np.empty((num_envs, 0))
         self._columns: dict[tuple[str, tuple[int, ...]], int] = {}
-        self._scratch: tuple[mujoco.MjModel, mujoco.MjData] | None = None
-        self._derived: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]] | None = None
+        self._scratch: list[_Scratch] = []
+        self._pool: ThreadPoolExecutor | None = None
 
     def write(
         self,
@@ -151,27 +164,47 @@ class ModelBatch:
             return np.full(self.num_envs, self._nominal(field, indices))
         return self.table[:, column].copy()
 
+    def column(self, field: str, indices: tuple[int, ...]) -> int:
+        """Return the column of the table that holds an entry; there is one from now on."""
+        known = self._columns.get((field, indices))
+        return self._add(field, indices) if known is None else known
+
     def refresh(self, rows: NDArray[np.bool_] | None = None) -> None:
         """Recompute what MuJoCo derives from masses, inertias and positions (``mj_setConst``).
 
         Args:
             rows: Which environments to refresh, boolean, shape ``(N,)``; default all.
         """
-        if self._scratch is None:
-            model = copy.copy(self.model)
-            self._scratch = model, mujoco.MjData(model)
+        if not self._scratch:
+            self._scratch.append(_Scratch(self.model))
             for field in _DERIVED:
-                shape = () if field in _SCALARS else np.shape(_attribute(model, field))
+                shape = () if field in _SCALARS else np.shape(_attribute(self.model, field))
                 for indices in np.ndindex(shape):
-                    self._add(field, indices)
-        model, data = self._scratch
-        if self._derived is None:
-            keys = [key for key in self._columns if key[0] in _DERIVED]
-            derived = np.array([_address(model, *key) for key in keys], dtype=np.int64)
-            columns = np.array([self._columns[key] for key in keys], dtype=np.int64)
-            self._derived = self.addresses(model), derived, columns
+                    self.column(field, indices)
         selected = np.arange(self.num_envs) if rows is None else np.flatnonzero(rows)
-        native.refresh(model._address, data._address, selected, self.table, *self._derived)
+        threads = min(self.threads, len(selected) // _SHARE)
+        if threads < 2:
+            self._refresh(0, selected)
+            return
+        while len(self._scratch) < threads:
+            self._scratch.append(_Scratch(self.model))
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(self.threads - 1)
+        first, *others = np.array_split(selected, threads)
+        futures = [self._pool.submit(self._refresh, i, part) for i, part in enumerate(others, 1)]
+        self._refresh(0, first)
+        for future in futures:
+            future.result()
+
+    def _refresh(self, thread: int, rows: NDArray[np.int64]) -> None:
+        scratch = self._scratch[thread]
+        if len(scratch.columns) != len(self._columns):
+            scratch.columns = self.addresses(scratch.model)
+            places = [c for key, c in self._columns.items() if key[0] in _DERIVED]
+            scratch.derived = np.array(places, dtype=np.int64)
+        columns, derived = scratch.columns, scratch.derived
+        model, data = scratch.model._address, scratch.data._address
+        native.refresh(model, data, rows, self.table, columns, derived)
 
     def resize(self, num_envs: int) -> None:
         """Change the number of environments; new ones have the nominal physics."""
@@ -191,7 +224,7 @@ class ModelBatch:
 
         Both know the same entries, and the same of them are overridden, from then on separately.
         """
-        other = ModelBatch(self.model, self.num_envs * count)
+        other = ModelBatch(self.model, self.num_envs * count, threads=self.threads)
         other._columns = dict(self._columns)
         other.table = np.repeat(self.table, count, axis=0)
         return other
@@ -221,7 +254,6 @@ class ModelBatch:
         column = np.full((self.num_envs, 1), value)
         self.table = np.concatenate([self.table, column], axis=1)
         self._columns[field, indices] = len(self._columns)
-        self._derived = None
         return self._columns[field, indices]
 
     def _nominal(self, field: str, indices: tuple[int, ...]) -> float:

@@ -221,14 +221,14 @@ def advance(worker, batch, drive, queue, rows, outputs, commands, sequence, subs
 
 
 @compiled
-def refresh(model, data, rows, table, addresses, derived, columns):
+def refresh(model, data, rows, table, addresses, derived):
     """Let MuJoCo recompute the constants that depend on the overrides of ``rows``.
 
-    ``derived`` are the addresses of those constants in the scratch ``model``, and ``columns`` their
-    places in the table.
+    ``addresses`` are those of the table's columns in the scratch ``model``, and ``derived`` the
+    columns that hold the constants.
     """
     for i in rows:
         override(addresses, table, i)
         mj_set_const(model, data)
-        for j in range(derived.shape[0]):
-            table[i, columns[j]] = doubles(derived[j])[0]
+        for j in derived:
+            table[i, j] = doubles(addresses[j])[0]

@@ -149,7 +149,7 @@ class Stepper:
         self.initial = np.zeros(max(part.stop for part in self.components.values()))
         size = mujoco.mj_stateSize(model, _SIGNATURE)
         mujoco.mj_getState(model, mujoco.MjData(model), self.initial[:size], _SIGNATURE)
-        self.models = ModelBatch(model, num_envs // sharing)
+        self.models = ModelBatch(model, num_envs // sharing, threads=threads)
         self.resize(num_envs)
 
     def resize(self, num_envs: int) -> None:
