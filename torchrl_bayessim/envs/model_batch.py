@@ -247,8 +247,8 @@ class ModelBatch:
 
     def _add(self, field: str, indices: tuple[int, ...]) -> int:
         value = self._nominal(field, indices)
-        if field in ("body_ipos", "body_iquat") and self.model.body_simple[indices[0]] == 1:
-            hint = "give the body an inertial frame off its origin in the MJCF"
+        if field in ("body_ipos", "body_iquat") and self.model.body_simple[indices[0]]:
+            hint = "give the body simple='false' in the MJCF"
             expected = "a body whose centre of mass is not at its origin, to move it"
             raise PhysicsError(message(expected, self.model.body(indices[0]).name, hint=hint))
         column = np.full((self.num_envs, 1), value)

@@ -13,11 +13,10 @@ set both geoms, under one name::
 
 from __future__ import annotations
 
-__all__ = ["MujocoPhysics"]
+__all__ = ["DERIVED_FROM", "MujocoPhysics"]
 
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -28,9 +27,10 @@ from torchrl.envs import EnvBase
 from ..errors import PhysicsError, message
 from .geom_bounds import fit_bounds
 from .model_fields import Entries, resolve
+from .mujoco_models import MujocoModels, models_of
 
 # Fields from which mj_setConst derives others (inverse weights, subtree masses, lengths at qpos0).
-_DERIVED_FROM = {
+DERIVED_FROM = {
     "body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat",
     "dof_armature", "jnt_pos", "jnt_axis", "site_pos", "actuator_gear", "tendon_stiffness",
 }  # fmt: skip
@@ -103,7 +103,7 @@ class MujocoPhysics:
                     _scale_inertia(models, indices[0], new, rows)
                 elif entry.field == "geom_size":
                     fit_bounds(models, indices[0], rows)
-        if any(entry.field in _DERIVED_FROM for entry, _ in todo):
+        if any(entry.field in DERIVED_FROM for entry, _ in todo):
             models.refresh(rows)
 
     def read(self, env: EnvBase, *, tensordict: TensorDictBase) -> Tensor:
@@ -120,7 +120,7 @@ class MujocoPhysics:
 
     def _resolved(self, env: EnvBase) -> tuple[Any, list[list[Entries]]]:
         """Return the models and this adapter's entries of them, resolved once per model."""
-        models = _models(env)
+        models = models_of(env)
         known = models.resolved.get(self._targets)
         if known is None:
             known = [[resolve(models.model, t) for t in group] for group in self._targets]
@@ -128,88 +128,8 @@ class MujocoPhysics:
         return models, known
 
 
-class _Models:
-    """One interface to the model of one environment, and to those of a batched one."""
-
-    def __init__(self, model: mujoco.MjModel, batch: Any = None) -> None:
-        self.model, self._batch = model, batch
-        self.resolved: dict[tuple[tuple[str, ...], ...], list[list[Entries]]] = {}
-        self._nominal: dict[str, NDArray[np.float64]] = {}
-        self._scratch: mujoco.MjData | None = None
-
-    def nominal(self, field: str, indices: tuple[int, ...]) -> float:
-        if field not in self._nominal:  # nobody but us writes, and every write asks first
-            self._nominal[field] = _array(self.model, field).copy()
-        return float(self._nominal[field][indices])
-
-    def read(self, field: str, indices: tuple[int, ...]) -> NDArray[np.float64]:
-        if self._batch is not None:
-            return self._batch.read(field, indices)
-        return np.array([_array(self.model, field)[indices]])
-
-    def write(
-        self,
-        field: str,
-        indices: tuple[int, ...],
-        values: NDArray[np.float64],
-        rows: NDArray[np.bool_],
-    ) -> None:
-        if self._batch is not None:
-            self._batch.write(field, indices, values, rows)
-        elif rows.all():
-            self.nominal(field, indices)
-            if indices:
-                _array(self.model, field)[indices] = values[0]
-            else:
-                setattr(self.model.opt, field.removeprefix("opt."), float(values[0]))
-
-    def refresh(self, rows: NDArray[np.bool_]) -> None:
-        if self._batch is not None:
-            self._batch.refresh(rows)
-        elif rows.all():
-            if self._scratch is None:  # mj_setConst leaves its data at qpos0: not the simulator's
-                self._scratch = mujoco.MjData(self.model)
-            view = ("center", "extent", "meansize", "meanmass")  # may be set in the XML
-            stat = self.model.stat
-            before = {name: np.copy(getattr(stat, name)) for name in view}
-            mujoco.mj_setConst(self.model, self._scratch)
-            for name, value in before.items():
-                setattr(stat, name, value if value.ndim else float(value))
-
-
-def _array(model: mujoco.MjModel, field: str) -> NDArray[np.float64]:
-    owner = model.opt if field.startswith("opt.") else model
-    return np.asarray(getattr(owner, field.removeprefix("opt.")))
-
-
-def _models(env: Any) -> _Models:
-    """Return the environment's models, noted on the environment itself."""
-    # not getattr: TorchRL's looks through hundreds of names for what is missing
-    batch = env.models if hasattr(type(env), "models") else None
-    model = _model(env) if batch is None else batch.model
-    known = env.__dict__.get("_mujoco_models")
-    if known is None or known.model is not model:
-        known = env.__dict__["_mujoco_models"] = _Models(model, batch)
-    return known
-
-
-def _model(env: Any) -> mujoco.MjModel:
-    inner = env.__dict__.get("_env", env)  # inside GymEnv, DMControlEnv
-    inner = getattr(inner, "unwrapped", inner)
-    inner = getattr(inner, "physics", inner)  # of dm_control
-    backend = env.__dict__.get("_backend")  # of TorchRL's MujocoEnv
-    if backend is not None and isinstance(getattr(backend, "_d", None), mujoco.MjData):
-        model = backend.mj_model  # other backends only keep the model that they compiled
-    else:
-        model = getattr(inner, "model", None)
-    model = getattr(model, "ptr", model)
-    if not isinstance(model, mujoco.MjModel):
-        raise PhysicsError(message("an environment with an MjModel", type(inner).__name__))
-    return model
-
-
 def _scale_inertia(
-    models: _Models, body: int, mass: NDArray[np.float64], rows: NDArray[np.bool_]
+    models: MujocoModels, body: int, mass: NDArray[np.float64], rows: NDArray[np.bool_]
 ) -> None:
     """Keep a body's shape: its inertia is proportional to its mass."""
     nominal = models.nominal("body_mass", (body,))

@@ -1,0 +1,125 @@
+"""Where the MuJoCo models of an environment are, and how to read and write their entries."""
+
+from __future__ import annotations
+
+__all__ = ["MujocoModels", "models_of"]
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import PhysicsError, message
+from .model_fields import Entries
+
+# Where a frame coincides with its body's (or inertial) frame MuJoCo copies it and ignores these.
+_FRAMES = {
+    f"{kind}_{place}": f"{kind}_sameframe"
+    for kind, places in {
+        "body": ("ipos", "iquat"),
+        "geom": ("pos", "quat"),
+        "site": ("pos", "quat"),
+    }.items()
+    for place in places
+}
+
+
+class MujocoModels:
+    """One interface to the model of one environment, and to those of a batched one.
+
+    Attributes:
+        model: The one model, or the batched environment's nominal one.
+        resolved: Entries by the targets that they were resolved from.
+    """
+
+    def __init__(self, model: mujoco.MjModel, batch: Any = None) -> None:
+        self.model, self._batch = model, batch
+        self.resolved: dict[tuple[tuple[str, ...], ...], list[list[Entries]]] = {}
+        self._nominal: dict[str, NDArray[np.float64]] = {}
+        self._scratch: mujoco.MjData | None = None
+
+    def nominal(self, field: str, indices: tuple[int, ...]) -> float:
+        """Return the value of an entry before anything was written."""
+        if field not in self._nominal:  # nobody but us writes, and every write asks first
+            self._nominal[field] = _array(self.model, field).copy()
+        return float(self._nominal[field][indices])
+
+    def read(self, field: str, indices: tuple[int, ...]) -> NDArray[np.float64]:
+        """Return an entry, one number per environment."""
+        if self._batch is not None:
+            return self._batch.read(field, indices)
+        return np.array([_array(self.model, field)[indices]])
+
+    def write(
+        self,
+        field: str,
+        indices: tuple[int, ...],
+        values: NDArray[np.float64],
+        rows: NDArray[np.bool_],
+    ) -> None:
+        """Set an entry in the environments ``rows``."""
+        if self._batch is not None:
+            self._batch.write(field, indices, values, rows)
+        elif rows.all():
+            self.nominal(field, indices)
+            if field in _FRAMES:
+                _separate(self.model, field, indices[0])
+            if indices:
+                _array(self.model, field)[indices] = values[0]
+            else:
+                setattr(self.model.opt, field.removeprefix("opt."), float(values[0]))
+
+    def refresh(self, rows: NDArray[np.bool_]) -> None:
+        """Recompute what MuJoCo derives from other entries (``mj_setConst``)."""
+        if self._batch is not None:
+            self._batch.refresh(rows)
+        elif rows.all():
+            if self._scratch is None:  # mj_setConst leaves its data at qpos0: not the simulator's
+                self._scratch = mujoco.MjData(self.model)
+            view = ("center", "extent", "meansize", "meanmass")  # may be set in the XML
+            stat = self.model.stat
+            before = {name: np.copy(getattr(stat, name)) for name in view}
+            mujoco.mj_setConst(self.model, self._scratch)
+            for name, value in before.items():
+                setattr(stat, name, value if value.ndim else float(value))
+
+
+def _array(model: mujoco.MjModel, field: str) -> NDArray[np.float64]:
+    owner = model.opt if field.startswith("opt.") else model
+    return np.asarray(getattr(owner, field.removeprefix("opt.")))
+
+
+def models_of(env: Any) -> MujocoModels:
+    """Return the environment's models, noted on the environment itself."""
+    # not getattr: TorchRL's looks through hundreds of names for what is missing
+    batch = env.models if hasattr(type(env), "models") else None
+    model = _model(env) if batch is None else batch.model
+    known = env.__dict__.get("_mujoco_models")
+    if known is None or known.model is not model:
+        known = env.__dict__["_mujoco_models"] = MujocoModels(model, batch)
+    return known
+
+
+def _model(env: Any) -> mujoco.MjModel:
+    inner = env.__dict__.get("_env", env)  # inside GymEnv, DMControlEnv
+    inner = getattr(inner, "unwrapped", inner)
+    inner = getattr(inner, "physics", inner)  # of dm_control
+    backend = env.__dict__.get("_backend")  # of TorchRL's MujocoEnv
+    if backend is not None and isinstance(getattr(backend, "_d", None), mujoco.MjData):
+        model = backend.mj_model  # other backends only keep the model that they compiled
+    else:
+        model = getattr(inner, "model", None)
+    model = getattr(model, "ptr", model)
+    if not isinstance(model, mujoco.MjModel):
+        raise PhysicsError(message("an environment with an MjModel", type(inner).__name__))
+    return model
+
+
+def _separate(model: mujoco.MjModel, field: str, row: int) -> None:
+    """Let a frame move: MuJoCo ignores the place of one that coincides with its body's."""
+    if field in ("body_ipos", "body_iquat") and model.body_simple[row]:
+        hint = "give the body simple='false' in the MJCF"
+        expected = "a body whose centre of mass is not at its origin, to move it"
+        raise PhysicsError(message(expected, model.body(row).name, hint=hint))
+    getattr(model, _FRAMES[field])[row] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
