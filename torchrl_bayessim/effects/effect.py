@@ -49,11 +49,12 @@ Memory = Mapping[str, Tensor]
 Now = SimpleNamespace
 """What a law may look at; tensors ``(*batch, size)``.
 
-``time``: seconds since the episode began, ``(*batch, 1)``; ``noise``: uniform numbers in [0, 1) of
-this control step, as many as there are targets; where there is a MuJoCo model also ``position`` and
-``velocity`` of the joints ``(*batch, J)``, ``load``: the generalised force that actuators exert at
-the joints ``(*batch, J)``, ``command`` ``(*batch, A)``, ``actuator_velocity`` ``(*batch, A)``, and
-``timestep``, the seconds that a force is held (a float).
+``robot``: the `Robot`; ``time``: seconds since the episode began, ``(*batch, 1)``; ``noise``:
+uniform numbers in [0, 1) of this control step, as many as there are targets, for random effects.
+For forces, in joint order: ``position`` and ``velocity`` ``(*batch, J)``, and ``load``, the
+generalised force that actuators exert ``(*batch, J)``; in actuator order: ``command``,
+``actuator_velocity``, ``actuator_force`` and ``actuator_gain``, the force per unit of command
+``(*batch, A)``; and ``timestep``, the seconds that a force is held (a float).
 """
 
 
@@ -68,6 +69,7 @@ class Effect(ABC):
             ``contact``, ``geometry``, ``noise``, ``disturbance``.
         channel: Where it sits: ``sensing``, ``actuation``, ``body`` or ``contact``.
         random: Whether it changes the distribution of what is seen rather than its mean.
+        memoryless: Whether the law depends on this step only, so that sequences are one call.
     """
 
     name: ClassVar[str]
@@ -75,6 +77,18 @@ class Effect(ABC):
     group: ClassVar[str]
     channel: ClassVar[str]
     random: ClassVar[bool] = False
+    memoryless: ClassVar[bool] = False
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether the other is the same law with the same options."""
+        return type(self) is type(other) and vars(self) == vars(other)
+
+    def __hash__(self) -> int:
+        return hash((type(self), *sorted(vars(self).items())))
+
+    def __repr__(self) -> str:
+        options = ", ".join(f"{name}={value!r}" for name, value in vars(self).items())
+        return f"{type(self).__name__}({options})"
 
     @abstractmethod
     def targets(self, robot: Robot) -> tuple[str, ...]:
@@ -97,8 +111,6 @@ class ActionEffect(Effect):
     """Changes the command, at every control step; targets are actuators."""
 
     channel = "actuation"
-    memoryless: ClassVar[bool] = False
-    """Whether the law depends on this step only, so that whole sequences are one call."""
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the actuators' names."""
@@ -109,7 +121,10 @@ class ActionEffect(Effect):
         return robot.joint_of_actuator[target]
 
     def start(self, action: Tensor) -> Memory:
-        """Return the memory at the beginning, for actions of this shape and kind."""
+        """Return the memory at the beginning, for actions of this shape and kind.
+
+        Only their shape and kind count: a transform asks before there is an action.
+        """
         del action
         return {}
 
@@ -129,8 +144,8 @@ class ForceEffect(Effect):
     channel = "body"
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
-        """Return the joints' names."""
-        return robot.joints
+        """Return the joints' names, none without a MuJoCo model."""
+        return () if robot.model is None else robot.joints
 
     def joint(self, robot: Robot, target: int) -> int:
         """Return the joint."""
@@ -151,7 +166,7 @@ class ForceEffect(Effect):
         Returns:
             Any of ``force``, ``frictionloss`` and ``damping``, shape ``(*batch, J)`` in N m or N
             (dry friction and damping are solved implicitly, and so stay stable), and ``command``,
-            shape ``(*batch, A)``.
+            what is added to the commands, shape ``(*batch, A)``.
         """
 
 
@@ -191,7 +206,7 @@ class SensorEffect(Effect):
         return robot.channel_joint[target]
 
     def start(self, reading: Tensor) -> Memory:
-        """Return the memory at the beginning, given the first true values."""
+        """Return the memory at the beginning, for values of this shape and kind."""
         del reading
         return {}
 
@@ -201,13 +216,13 @@ class SensorEffect(Effect):
     ) -> tuple[Tensor, Memory]:
         """Return what is measured of the true values, shape ``(*batch, C)``, and the new memory."""
 
-    def restore(self, measured: Tensor, strength: Tensor, dt: float) -> Tensor:
+    def restore(self, measured: Tensor, strength: Tensor, now: Now) -> Tensor:
         """Return the true values behind a whole record, as far as they can be known.
 
         Args:
             measured: The record, shape ``(*batch, T, C)``.
             strength: Shape ``(*batch, C)``.
-            dt: Seconds per step.
+            now: Its ``time`` has shape ``(*batch, T, 1)``; ``robot.dt`` are the seconds per step.
         """
-        del strength, dt
+        del strength, now
         return measured

@@ -19,7 +19,6 @@ from torch import Tensor
 from ..envs.task import Task
 from ..errors import message
 
-
 _SLIDE = int(
     mujoco.mjtJoint.mjJNT_SLIDE
 )  # slides and hinges have one coordinate, the others several
@@ -67,6 +66,16 @@ class Robot:
     qpos_index: tuple[int, ...] = ()
     dof_index: tuple[int, ...] = ()
     model: mujoco.MjModel | None = None
+
+    def require_model(self) -> mujoco.MjModel:
+        """Return the model.
+
+        Raises:
+            ValueError: There is none.
+        """
+        if self.model is None:
+            raise ValueError(message("a robot with a MuJoCo model", "none", hint="robot_of(task)"))
+        return self.model
 
 
 def robot_of(task: Task) -> Robot:

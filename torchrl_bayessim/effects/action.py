@@ -1,0 +1,247 @@
+"""What happens to a command before it acts: timing, distortion and loss, at every control step.
+
+Strengths are per actuator, in seconds, in units of the command or as fractions. ``u`` is the
+command, ``Δ`` the control step and ``u_max`` the robot's ``command_scale``.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "ActionBias",
+    "ActionDelay",
+    "ActionGain",
+    "ActionJitter",
+    "ActionLag",
+    "ActionQuantization",
+    "BatterySag",
+    "DeadBand",
+    "PacketDrop",
+    "Saturation",
+]
+
+import torch
+from torch import Tensor
+
+from .effect import ActionEffect, Memory, Now
+from .history import delayed, empty_line, filled, read_line
+from .laws import decay, quantized, within
+from .robot import Robot
+
+_LONGEST = 8  # control steps that a delay line remembers
+
+
+class ActionDelay(ActionEffect):
+    """Commands act late: ``(1−f) u_{k−n} + f u_{k−n−1}`` with ``s = (n+f) Δ``.
+
+    In seconds, 0 to 5 control steps or 0.1 s. From logs of commands and measurements alone it
+    cannot be told from a delay of all sensors.
+    """
+
+    name, unit, group = "action_delay", "s", "timing"
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 5 control steps, at most 0.1 s."""
+        return within(torch.ones_like(robot.command_scale), 0.0, min(5 * robot.dt, 0.1))
+
+    def start(self, action: Tensor) -> Memory:
+        """Return a delay line that remembers nothing."""
+        return {"past": empty_line(action, _LONGEST)}
+
+    def command(
+        self, action: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return the command of ``s`` seconds ago."""
+        late, past = read_line(memory["past"], action, strength / now.robot.dt)
+        return late, {"past": past}
+
+    def whole(self, actions: Tensor, strength: Tensor, now: Now) -> Tensor:
+        """Return a whole sequence, delayed."""
+        return delayed(actions, (strength / now.robot.dt).unsqueeze(-2).clamp(max=_LONGEST))
+
+
+class ActionJitter(ActionEffect):
+    """Commands act late by another time at each step, uniform between 0 and ``s`` seconds."""
+
+    name, unit, group, random = "action_jitter", "s", "timing", True
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 2 control steps."""
+        return within(torch.ones_like(robot.command_scale), 0.0, 2 * robot.dt)
+
+    def start(self, action: Tensor) -> Memory:
+        """Return a delay line that remembers nothing."""
+        return {"past": empty_line(action, _LONGEST)}
+
+    def command(
+        self, action: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return a command of up to ``s`` seconds ago."""
+        late, past = read_line(memory["past"], action, now.noise * strength / now.robot.dt)
+        return late, {"past": past}
+
+    def whole(self, actions: Tensor, strength: Tensor, now: Now) -> Tensor:
+        """Return a whole sequence, delayed."""
+        steps = now.noise * strength.unsqueeze(-2) / now.robot.dt
+        return delayed(actions, steps.clamp(max=_LONGEST))
+
+
+class ActionLag(ActionEffect):
+    """The drive follows the command with a time constant: ``a ← u + e^{−Δ/s} (a − u)``.
+
+    In seconds, 0 to 0.15; a first-order filter, exact for commands that are held.
+    """
+
+    name, unit, group = "action_lag", "s", "timing"
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 0.15 s."""
+        return within(torch.ones_like(robot.command_scale), 0.0, 0.15)
+
+    def start(self, action: Tensor) -> Memory:
+        """Return no command yet."""
+        return {"last": torch.full_like(action, torch.nan)}
+
+    def command(
+        self, action: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return what the drive has reached."""
+        last = filled(memory["last"], action)
+        reached = action + decay(now.robot.dt, strength) * (last - action)
+        return reached, {"last": reached}
+
+
+class DeadBand(ActionEffect):
+    """Small commands do nothing and all lose ``s``: ``sgn(u) max(|u| − s, 0)``.
+
+    In units of the command, 0 to 40 % of ``u_max``.
+    """
+
+    name, unit, group, memoryless = "dead_band", "command", "friction", True
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 0.4 ``u_max``."""
+        return within(robot.command_scale, 0.0, 0.4)
+
+    def command(
+        self, action: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return what exceeds the band."""
+        del now
+        return action - action.clamp(-strength, strength), memory
+
+
+class Saturation(ActionEffect):
+    """Strong commands are cut: ``clip(u, ±(1 − s) u_max)``, where ``u_max`` bounds commands.
+
+    A fraction, 0 to 0.8.
+    """
+
+    name, unit, group, memoryless = "saturation", "fraction", "gain", True
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 0.8."""
+        return within(torch.ones_like(robot.command_scale), 0.0, 0.8)
+
+    def command(
+        self, action: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return the command within its limit."""
+        limit = (1 - strength) * now.robot.command_scale.to(action)
+        return torch.where(strength > 0, action.clamp(-limit, limit), action), memory
+
+
+class ActionGain(ActionEffect):
+    """The drive is stronger or weaker than told: ``(1 + s) u``; a fraction, −0.5 to 0.5."""
+
+    name, unit, group, memoryless = "action_gain", "fraction", "gain", True
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return −0.5 and 0.5."""
+        return within(torch.ones_like(robot.command_scale), -0.5, 0.5)
+
+    def command(
+        self, action: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return the scaled command."""
+        del now
+        return action * (1 + strength), memory
+
+
+class ActionBias(ActionEffect):
+    """A constant is added: ``u + s``; in units of the command, up to 30 % of ``u_max``."""
+
+    name, unit, group, memoryless = "action_bias", "command", "offset", True
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return ±0.3 ``u_max``."""
+        return within(robot.command_scale, -0.3, 0.3)
+
+    def command(
+        self, action: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return the shifted command."""
+        del now
+        return action + strength, memory
+
+
+class BatterySag(ActionEffect):
+    """The drive weakens with time: ``u (1 − s min(t / T, 1.5))``; a fraction, 0 to 0.6.
+
+    Args:
+        seconds: ``T``, after which the fraction ``s`` is lost.
+    """
+
+    name, unit, group, memoryless = "battery_sag", "fraction", "gain", True
+
+    def __init__(self, seconds: float = 10.0) -> None:
+        self.seconds = seconds
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 0.6."""
+        return within(torch.ones_like(robot.command_scale), 0.0, 0.6)
+
+    def command(
+        self, action: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return the command that the battery still supports."""
+        spent = (now.time.to(action) / self.seconds).clamp(max=1.5)
+        return action * (1 - strength * spent), memory
+
+
+class PacketDrop(ActionEffect):
+    """With probability ``s`` a command is lost, and the last one that arrived stays; 0 to 0.4."""
+
+    name, unit, group, random = "packet_drop", "probability", "noise", True
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 0.4."""
+        return within(torch.ones_like(robot.command_scale), 0.0, 0.4)
+
+    def start(self, action: Tensor) -> Memory:
+        """Return no command yet."""
+        return {"last": torch.full_like(action, torch.nan)}
+
+    def command(
+        self, action: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return this command or the last that arrived."""
+        arrived = torch.where(now.noise < strength, filled(memory["last"], action), action)
+        return arrived, {"last": arrived}
+
+
+class ActionQuantization(ActionEffect):
+    """Commands are rounded to multiples of ``s``; in their units, 0 to 20 % of ``u_max``."""
+
+    name, unit, group = "action_quantization", "command", "noise"
+    memoryless, random = True, True
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 0.2 ``u_max``."""
+        return within(robot.command_scale, 0.0, 0.2)
+
+    def command(
+        self, action: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return the nearest multiple."""
+        del now
+        return quantized(action, strength), memory

@@ -1,0 +1,196 @@
+"""Masses, places and lengths of bodies, and the direction of gravity.
+
+Strengths add to the model's own values or scale them. Only bodies that move have targets.
+"""
+
+from __future__ import annotations
+
+__all__ = ["ComShift", "GravityTilt", "LinkLength", "Payload", "TimeScale"]
+
+import math
+
+import torch
+from torch import Tensor
+
+from .effect import Fields, ModelEffect
+from .robot import Robot
+
+
+class Payload(ModelEffect):
+    """Mass ``s`` is added to a body, and its inertia grows in proportion; kg, up to its mass."""
+
+    name, unit, group = "payload", "kg", "inertia"
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the names of bodies that move and have a mass."""
+        return tuple(_name(robot, b) for b in _heavy(robot))
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and the body's mass."""
+        mass = _values([robot.require_model().body_mass[b] for b in _heavy(robot)])
+        return torch.zeros_like(mass), mass
+
+    def joint(self, robot: Robot, target: int) -> int:
+        """Return the joint that moves the body."""
+        return _joint_of(robot, _heavy(robot)[target])
+
+    def write(self, fields: Fields, strength: Tensor, robot: Robot) -> None:
+        """Add to the masses."""
+        for i, body in enumerate(_heavy(robot)):
+            entry = "body_mass", (body,)
+            fields[entry] = fields[entry] + strength[..., i]
+
+
+class ComShift(ModelEffect):
+    """The centre of mass moves by ``s`` along an axis of its body; m, up to 20 % of its length.
+
+    Targets are a body and an axis: ``link x``. Bodies whose centre of mass MuJoCo takes to be
+    their origin for good (``body_simple``) have none.
+    """
+
+    name, unit, group = "com_shift", "m", "inertia"
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the names of bodies with each axis."""
+        return tuple(f"{_name(robot, b)} {a}" for b in self._bodies(robot) for a in "xyz")
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return ±20 % of the length of the rod that has the body's mass and inertia."""
+        lengths = []
+        for body in self._bodies(robot):
+            inertia = (
+                robot.require_model().body_inertia[body].max()
+                / robot.require_model().body_mass[body]
+            )
+            lengths += 3 * [math.sqrt(12 * inertia)]
+        return -0.2 * _values(lengths), 0.2 * _values(lengths)
+
+    def joint(self, robot: Robot, target: int) -> int:
+        """Return the joint that moves the body."""
+        return _joint_of(robot, self._bodies(robot)[target // 3])
+
+    def write(self, fields: Fields, strength: Tensor, robot: Robot) -> None:
+        """Add to the places of the bodies' inertial frames."""
+        for i, body in enumerate(self._bodies(robot)):
+            for axis in range(3):
+                entry = "body_ipos", (body, axis)
+                fields[entry] = fields[entry] + strength[..., 3 * i + axis]
+
+    def _bodies(self, robot: Robot) -> list[int]:
+        return [b for b in _heavy(robot) if not robot.require_model().body_simple[b]]
+
+
+class LinkLength(ModelEffect):
+    """The distance of a body from the one that carries it is scaled: ``(1 + s) ℓ``; ±0.1.
+
+    Only between bodies that both move; shapes and masses stay.
+    """
+
+    name, unit, group = "link_length", "fraction", "geometry"
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the names of the bodies at the links' ends."""
+        return tuple(_name(robot, b) for b in self._bodies(robot))
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return ±0.1."""
+        one = torch.ones(len(self._bodies(robot)), dtype=torch.float64)
+        return -0.1 * one, 0.1 * one
+
+    def joint(self, robot: Robot, target: int) -> int:
+        """Return the joint that moves the link."""
+        body = self._bodies(robot)[target]
+        return _joint_of(robot, int(robot.require_model().body_parentid[body]))
+
+    def write(self, fields: Fields, strength: Tensor, robot: Robot) -> None:
+        """Scale the places of the bodies in their parents."""
+        for i, body in enumerate(self._bodies(robot)):
+            for axis in range(3):
+                entry = "body_pos", (body, axis)
+                fields[entry] = fields[entry] * (1 + strength[..., i])
+
+    def _bodies(self, robot: Robot) -> list[int]:
+        model = robot.model
+        if model is None:
+            return []
+        return [
+            b
+            for b in _moving(robot)
+            if model.body_weldid[model.body_parentid[b]] and model.body_pos[b].any()
+        ]
+
+
+class GravityTilt(ModelEffect):
+    """Gravity is rotated by ``s`` about the world's x and y axes; rad, up to 0.35 (20°)."""
+
+    name, unit, group = "gravity_tilt", "rad", "offset"
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the two axes, none without gravity."""
+        gravity = robot.model is not None and robot.model.opt.gravity.any()
+        return ("x", "y") if gravity else ()
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return ±20°."""
+        del robot
+        high = torch.full((2,), math.radians(20.0), dtype=torch.float64)
+        return -high, high
+
+    def write(self, fields: Fields, strength: Tensor, robot: Robot) -> None:
+        """Rotate about x, then about y."""
+        del robot
+        x, y, z = (fields["opt.gravity", (axis,)] for axis in range(3))
+        about_x, about_y = strength[..., 0], strength[..., 1]
+        y, z = about_x.cos() * y - about_x.sin() * z, about_x.sin() * y + about_x.cos() * z
+        x, z = about_y.cos() * x + about_y.sin() * z, about_y.cos() * z - about_y.sin() * x
+        for axis, value in enumerate((x, y, z)):
+            fields["opt.gravity", (axis,)] = value
+
+
+class TimeScale(ModelEffect):
+    """Time runs at another speed: the time step is ``(1 + s) h``; a fraction, −0.2 to 0.2."""
+
+    name, unit, group = "time_scale", "fraction", "inertia"
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return ``all``."""
+        return () if robot.model is None else ("all",)
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return ±0.2."""
+        del robot
+        return torch.tensor([-0.2]).double(), torch.tensor([0.2]).double()
+
+    def write(self, fields: Fields, strength: Tensor, robot: Robot) -> None:
+        """Scale the time step."""
+        del robot
+        fields["opt.timestep", ()] = fields["opt.timestep", ()] * (1 + strength[..., 0])
+
+
+def _values(numbers: list[float]) -> Tensor:
+    return torch.tensor(numbers, dtype=torch.float64)
+
+
+def _name(robot: Robot, body: int) -> str:
+    return robot.require_model().body(body).name or f"body{body}"
+
+
+def _moving(robot: Robot) -> list[int]:
+    """Return the bodies that are not welded to the world."""
+    model = robot.model
+    return [] if model is None else [b for b in range(1, model.nbody) if model.body_weldid[b]]
+
+
+def _heavy(robot: Robot) -> list[int]:
+    return [b for b in _moving(robot) if robot.require_model().body_mass[b] > 0]
+
+
+def _joint_of(robot: Robot, body: int) -> int:
+    """Return the hinge or slide nearest to a body, towards the world; -1 for none."""
+    model = robot.require_model()
+    while body:
+        for dof in reversed(range(model.nv)):
+            if model.dof_bodyid[dof] == body and dof in robot.dof_index:
+                return robot.dof_index.index(dof)
+        body = int(model.body_parentid[body])
+    return -1

@@ -1,0 +1,79 @@
+"""All effects by name."""
+
+from __future__ import annotations
+
+__all__ = ["CATALOGUE", "effect"]
+
+from types import MappingProxyType
+from typing import Any
+
+from ..errors import message
+from . import action, bodies, contacts, disturbance, friction, joints, sensors, transmission
+from .effect import Effect
+
+CATALOGUE = MappingProxyType(
+    {
+        kind.name: kind
+        for kind in (
+            action.ActionDelay,
+            action.ActionLag,
+            action.DeadBand,
+            action.Saturation,
+            action.ActionGain,
+            action.ActionBias,
+            transmission.TorqueSpeedLimit,
+            action.BatterySag,
+            action.PacketDrop,
+            action.ActionJitter,
+            action.ActionQuantization,
+            transmission.Backlash,
+            joints.CoulombFriction,
+            friction.StribeckFriction,
+            joints.ViscousFriction,
+            friction.QuadraticDrag,
+            friction.LoadDependentFriction,
+            friction.DirectionalFriction,
+            joints.ParallelSpring,
+            transmission.SeriesElasticity,
+            bodies.GravityTilt,
+            disturbance.ConstantForce,
+            disturbance.PeriodicDisturbance,
+            disturbance.Cogging,
+            bodies.Payload,
+            bodies.ComShift,
+            joints.Armature,
+            contacts.ContactFriction,
+            contacts.ContactSoftness,
+            bodies.LinkLength,
+            bodies.TimeScale,
+            sensors.SensorDelay,
+            sensors.SensorBias,
+            sensors.SensorGain,
+            sensors.SensorNoise,
+            sensors.SensorQuantization,
+            sensors.SensorLag,
+            sensors.SensorDrift,
+            sensors.SensorDropout,
+        )
+    }
+)
+"""The kinds of effects, by name."""
+
+
+def effect(name: str, **options: Any) -> Effect:
+    """Return an effect of the catalogue.
+
+    Args:
+        name: Its name.
+        **options: Of its kind, such as the ``frequency`` of a ``periodic_disturbance``.
+
+    Example:
+        >>> effect("periodic_disturbance", frequency=2.0)
+        PeriodicDisturbance(frequency=2.0, phase=0.0)
+
+    Raises:
+        KeyError: The catalogue has no such effect.
+    """
+    if name not in CATALOGUE:
+        raise KeyError(message("an effect of the catalogue", name, available=CATALOGUE))
+    return CATALOGUE[name](**options)

@@ -1,0 +1,96 @@
+"""Forces that come from outside or from within a motor, at every time step.
+
+Strengths are per joint, in N m or N; ``F_max`` is the joint's force scale.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Cogging", "ConstantForce", "PeriodicDisturbance"]
+
+import math
+from collections.abc import Mapping
+
+import mujoco
+import torch
+from torch import Tensor
+
+from .effect import ForceEffect, Memory, Now
+from .laws import within
+from .robot import Robot
+
+
+class ConstantForce(ForceEffect):
+    """A constant generalised force ``s``: wind, a hanging cable; up to 30 % of ``F_max``."""
+
+    name, unit, group = "constant_force", "N m", "offset"
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return ±0.3 ``F_max``."""
+        return within(robot.force_scale, -0.3, 0.3)
+
+    def forces(
+        self, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Mapping[str, Tensor], Memory]:
+        """Return the force."""
+        return {"force": strength.expand_as(now.velocity)}, memory
+
+
+class PeriodicDisturbance(ForceEffect):
+    """A force that oscillates with time: ``s sin(2π f t + φ)``; up to 30 % of ``F_max``.
+
+    Args:
+        frequency: ``f``, Hz.
+        phase: ``φ``, rad.
+    """
+
+    name, unit, group = "periodic_disturbance", "N m", "disturbance"
+
+    def __init__(self, frequency: float = 1.0, phase: float = 0.0) -> None:
+        self.frequency, self.phase = frequency, phase
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 0.3 ``F_max``."""
+        return within(robot.force_scale, 0.0, 0.3)
+
+    def forces(
+        self, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Mapping[str, Tensor], Memory]:
+        """Return the force at this time."""
+        angle = 2 * math.pi * self.frequency * now.time.to(now.velocity) + self.phase
+        return {"force": strength * angle.sin()}, memory
+
+
+class Cogging(ForceEffect):
+    """A force that oscillates with a hinge's angle: ``s sin(k q + φ)``; up to 15 % of ``F_max``.
+
+    Args:
+        number: ``k``, periods per turn.
+        phase: ``φ``, rad.
+    """
+
+    name, unit, group = "cogging", "N m", "disturbance"
+
+    def __init__(self, number: int = 6, phase: float = 0.0) -> None:
+        self.number, self.phase = number, phase
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the joints' names, none if there is no hinge."""
+        return robot.joints if bool(_hinges(robot).any()) else ()
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 0.15 ``F_max``, or 0 for slides."""
+        return within(robot.force_scale * _hinges(robot), 0.0, 0.15)
+
+    def forces(
+        self, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Mapping[str, Tensor], Memory]:
+        """Return the force at this angle."""
+        return {"force": strength * (self.number * now.position + self.phase).sin()}, memory
+
+
+def _hinges(robot: Robot) -> Tensor:
+    model = robot.model
+    if model is None:
+        return torch.ones(len(robot.joints), dtype=torch.bool)
+    types = [int(model.jnt_type[model.dof_jntid[dof]]) for dof in robot.dof_index]
+    return torch.tensor([t == int(mujoco.mjtJoint.mjJNT_HINGE) for t in types])

@@ -1,0 +1,101 @@
+"""Joint friction that depends on speed, direction or load, at every time step.
+
+Dry friction raises ``frictionloss`` and viscous friction ``damping``, which MuJoCo solves
+implicitly: joints stick, and large values stay stable. Strengths are per joint; ``v`` is the
+joint's velocity, ``F_max`` and ``v_max`` its force and velocity scales. Friction without these
+dependences is in `joints`. Sources: Armstrong-Hélouvry, Dupont, Canudas de Wit, Automatica 30
+(1994) for the laws; Duclusaud et al., arXiv 2410.08650, for load.
+"""
+
+from __future__ import annotations
+
+__all__ = ["DirectionalFriction", "LoadDependentFriction", "QuadraticDrag", "StribeckFriction"]
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from .effect import ForceEffect, Memory, Now
+from .laws import within
+from .robot import Robot
+
+
+class StribeckFriction(ForceEffect):
+    """Dry friction that fades with speed: ``s e^{−(v/v_s)²}``; N m or N, up to 30 % of ``F_max``.
+
+    Args:
+        speed: ``v_s``, rad/s or m/s.
+    """
+
+    name, unit, group = "stribeck_friction", "N m", "friction"
+
+    def __init__(self, speed: float = 0.2) -> None:
+        self.speed = speed
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 0.3 ``F_max``."""
+        return within(robot.force_scale, 0.0, 0.3)
+
+    def forces(
+        self, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Mapping[str, Tensor], Memory]:
+        """Return the dry friction at this speed."""
+        return {"frictionloss": strength * torch.exp(-((now.velocity / self.speed) ** 2))}, memory
+
+
+class QuadraticDrag(ForceEffect):
+    """Drag ``−s v |v|``, as a damping of ``s |v|``; N m s²/rad², up to 30 % of ``F_max/v_max²``."""
+
+    name, unit, group = "quadratic_drag", "N m s²/rad²", "friction"
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 0.3 ``F_max / v_max²``."""
+        return within(robot.force_scale / robot.velocity_scale**2, 0.0, 0.3)
+
+    def forces(
+        self, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Mapping[str, Tensor], Memory]:
+        """Return the damping at this speed."""
+        return {"damping": strength * now.velocity.abs()}, memory
+
+
+class LoadDependentFriction(ForceEffect):
+    """Dry friction in proportion to the actuators' force: ``s |F|``; a fraction, 0 to 0.4."""
+
+    name, unit, group = "load_dependent_friction", "fraction", "friction"
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the names of the joints, none if no actuator moves one."""
+        return robot.joints if any(j >= 0 for j in robot.joint_of_actuator) else ()
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 0.4, or 0 for joints without an actuator."""
+        high = [0.4 * (j in robot.joint_of_actuator) for j in range(len(robot.joints))]
+        return torch.zeros(len(high)).double(), torch.tensor(high, dtype=torch.float64)
+
+    def forces(
+        self, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Mapping[str, Tensor], Memory]:
+        """Return the dry friction under this load."""
+        return {"frictionloss": strength * now.load.abs()}, memory
+
+
+class DirectionalFriction(ForceEffect):
+    """Dry friction ``|s|`` in one direction only: where ``v`` has the sign of ``s``.
+
+    N m or N, up to 30 % of ``F_max`` in either direction.
+    """
+
+    name, unit, group = "directional_friction", "N m", "friction"
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return ±0.3 ``F_max``."""
+        return within(robot.force_scale, -0.3, 0.3)
+
+    def forces(
+        self, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Mapping[str, Tensor], Memory]:
+        """Return the dry friction in this direction."""
+        along = strength * now.velocity > 0
+        return {"frictionloss": torch.where(along, strength.abs(), 0.0)}, memory

@@ -1,0 +1,211 @@
+"""What happens to a measured value: timing, distortion, noise and loss, at every control step.
+
+Strengths are per channel, in seconds, in the channel's units or as fractions. ``x`` is the true
+value, ``Δ`` the control step. `restore` undoes a law on a whole record where it can be undone.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "SensorBias",
+    "SensorDelay",
+    "SensorDrift",
+    "SensorDropout",
+    "SensorGain",
+    "SensorLag",
+    "SensorNoise",
+    "SensorQuantization",
+]
+
+import torch
+from torch import Tensor
+
+from .effect import Memory, Now, SensorEffect
+from .history import advanced, delayed, empty_line, filled, read_line
+from .laws import decay, quantized, within
+from .robot import Robot
+
+_LONGEST = 8  # control steps that a delay line remembers
+_LEAST = 1e-7  # a uniform number of zero would be infinitely many standard deviations away
+
+
+class SensorDelay(SensorEffect):
+    """Values arrive late: ``(1−f) x_{k−n} + f x_{k−n−1}`` with ``s = (n+f) Δ``.
+
+    In seconds, 0 to 5 control steps or 0.1 s. The same on all channels, it cannot be told from a
+    delay of commands.
+    """
+
+    name, unit, group = "sensor_delay", "s", "timing"
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 5 control steps, at most 0.1 s."""
+        return within(torch.ones_like(robot.channel_scale), 0.0, min(5 * robot.dt, 0.1))
+
+    def start(self, reading: Tensor) -> Memory:
+        """Return a delay line that remembers nothing."""
+        return {"past": empty_line(reading, _LONGEST)}
+
+    def measure(
+        self, reading: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return the values of ``s`` seconds ago."""
+        late, past = read_line(memory["past"], reading, strength / now.robot.dt)
+        return late, {"past": past}
+
+    def whole(self, readings: Tensor, strength: Tensor, now: Now) -> Tensor:
+        """Return a whole record, delayed."""
+        return delayed(readings, (strength / now.robot.dt).unsqueeze(-2).clamp(max=_LONGEST))
+
+    def restore(self, measured: Tensor, strength: Tensor, now: Now) -> Tensor:
+        """Return the record ``s`` seconds earlier; the last values are held."""
+        return advanced(measured, (strength / now.robot.dt).unsqueeze(-2))
+
+
+class SensorBias(SensorEffect):
+    """A constant is added: ``x + s``; in the channel's units, up to 20 % of its scale."""
+
+    name, unit, group, memoryless = "sensor_bias", "channel", "offset", True
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return ±20 % of the scale."""
+        return within(robot.channel_scale, -0.2, 0.2)
+
+    def measure(
+        self, reading: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return the shifted values."""
+        del now
+        return reading + strength, memory
+
+    def restore(self, measured: Tensor, strength: Tensor, now: Now) -> Tensor:
+        """Return the values without the constant."""
+        del now
+        return measured - strength.unsqueeze(-2)
+
+
+class SensorGain(SensorEffect):
+    """Values are scaled: ``(1 + s) x``; a fraction, −0.2 to 0.2."""
+
+    name, unit, group, memoryless = "sensor_gain", "fraction", "gain", True
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return −0.2 and 0.2."""
+        return within(torch.ones_like(robot.channel_scale), -0.2, 0.2)
+
+    def measure(
+        self, reading: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return the scaled values."""
+        del now
+        return reading * (1 + strength), memory
+
+    def restore(self, measured: Tensor, strength: Tensor, now: Now) -> Tensor:
+        """Return the values before scaling."""
+        del now
+        return measured / (1 + strength.unsqueeze(-2))
+
+
+class SensorNoise(SensorEffect):
+    """White noise is added: ``x + s ε`` with ``ε ~ N(0, 1)``; up to 5 % of the channel's scale."""
+
+    name, unit, group = "sensor_noise", "channel", "noise"
+    memoryless, random = True, True
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 5 % of the scale."""
+        return within(robot.channel_scale, 0.0, 0.05)
+
+    def measure(
+        self, reading: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return the noisy values."""
+        normal = torch.special.ndtri(now.noise.clamp(_LEAST, 1 - _LEAST))
+        return reading + strength * normal, memory
+
+
+class SensorQuantization(SensorEffect):
+    """Values are rounded to multiples of ``s``: the step of an encoder; up to 5 % of the scale."""
+
+    name, unit, group = "sensor_quantization", "channel", "noise"
+    memoryless, random = True, True
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 5 % of the scale."""
+        return within(robot.channel_scale, 0.0, 0.05)
+
+    def measure(
+        self, reading: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return the nearest multiple."""
+        del now
+        return quantized(reading, strength), memory
+
+
+class SensorLag(SensorEffect):
+    """A first-order filter, as many make velocities: ``y ← x + e^{−Δ/s} (y − x)``; to 0.1 s."""
+
+    name, unit, group = "sensor_lag", "s", "timing"
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 0.1 s."""
+        return within(torch.ones_like(robot.channel_scale), 0.0, 0.1)
+
+    def start(self, reading: Tensor) -> Memory:
+        """Return no value yet."""
+        return {"last": torch.full_like(reading, torch.nan)}
+
+    def measure(
+        self, reading: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return what the filter shows."""
+        last = filled(memory["last"], reading)
+        shown = reading + decay(now.robot.dt, strength) * (last - reading)
+        return shown, {"last": shown}
+
+    def restore(self, measured: Tensor, strength: Tensor, now: Now) -> Tensor:
+        """Return ``(y_k − e y_{k−1}) / (1 − e)``."""
+        kept = decay(now.robot.dt, strength).unsqueeze(-2)
+        before = torch.cat([measured[..., :1, :], measured[..., :-1, :]], -2)
+        return measured + kept / (1 - kept) * (measured - before)
+
+
+class SensorDrift(SensorEffect):
+    """An offset grows with time: ``x + s t``; up to 10 % of the channel's scale per second."""
+
+    name, unit, group, memoryless = "sensor_drift", "channel/s", "offset", True
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return ±10 % of the scale per second."""
+        return within(robot.channel_scale, -0.1, 0.1)
+
+    def measure(
+        self, reading: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return the drifted values."""
+        return reading + strength * now.time.to(reading), memory
+
+    def restore(self, measured: Tensor, strength: Tensor, now: Now) -> Tensor:
+        """Return the values without the drift."""
+        return measured - strength.unsqueeze(-2) * now.time.to(measured)
+
+
+class SensorDropout(SensorEffect):
+    """With probability ``s`` a value is not renewed, and the last one shown stays; 0 to 0.3."""
+
+    name, unit, group, random = "sensor_dropout", "probability", "noise", True
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 0.3."""
+        return within(torch.ones_like(robot.channel_scale), 0.0, 0.3)
+
+    def start(self, reading: Tensor) -> Memory:
+        """Return no value yet."""
+        return {"last": torch.full_like(reading, torch.nan)}
+
+    def measure(
+        self, reading: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return this value or the last that was shown."""
+        shown = torch.where(now.noise < strength, filled(memory["last"], reading), reading)
+        return shown, {"last": shown}
