@@ -109,6 +109,7 @@ def measure(case: str, method: Callable[[int], LogDensity], seeds: int) -> None:
     shares = {
         "finished": 1 - len(failures) / seeds,
         "within_0.1": sum(distance <= 0.1 for distance in distances) / seeds,
+        "worst_seeds": sorted(range(seeds), key=distances.__getitem__)[-3:],
         "failures": sorted(set(failures)),
     }
     name = "sequential_two_modes"

@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from ..errors import message
+from ..randomness import seed_from
 from ..sources import Defensive, draw
 from .ensemble import learn
 from .fit import FitReport
@@ -63,6 +64,7 @@ def sequential(
     simulations: int,
     correction: Correction = "importance",
     prior_share: float = 0.2,
+    networks: int = 2,
     make_posterior: Callable[[int], MixtureDensityPosterior] | None = None,
     seed: int = 0,
     **fit_options: Any,
@@ -78,13 +80,21 @@ def sequential(
         correction: See :mod:`.proposals`. ``"importance"`` and ``"truncated"`` train on the pairs
             of all rounds; ``"analytic"`` on the last round's.
         prior_share: Share of the draws from the prior that is kept in every proposal.
+        networks: Networks fitted each round, on other splits of the pairs; the posterior is their
+            average, which is less sure where they disagree.
         make_posterior: Summary size to a fresh network; a default one if omitted.
         seed: Same seed, same rounds (if the simulator is deterministic).
         **fit_options: Passed to :func:`.fit.fit`.
 
     Yields:
         One :class:`SequentialRound` after another.
+
+    Raises:
+        ValueError: On the first turn, for an unknown correction or counts that are too small.
     """
+    if rounds < 1 or simulations < 4 or networks < 1:
+        expected = "at least 1 round, 4 simulations and 1 network"
+        raise ValueError(message(expected, (rounds, simulations, networks)))
     if correction not in {"importance", "truncated", "analytic"}:
         raise ValueError(
             message("a correction", correction, available=["importance", "truncated", "analytic"])
@@ -106,7 +116,7 @@ def sequential(
                 if make_posterior is None
                 else make_posterior(size)
             ),
-            seeds=[seed],
+            seeds=[seed, *(seed_from(seed, "network", i) for i in range(1, networks))],
             fit_options=fit_options,
         )
         repaired = 0
