@@ -237,7 +237,7 @@ def test_statistics_that_are_all_constant_leave_the_prior():
     data = linear_gaussian(600)
     data["summary"].zero_()
     net = posterior()
-    fit(net, data, epochs=20, lr=1e-2, progress=False)
+    fit(net, data, epochs=40, lr=1e-2, progress=False)
     z = PRIOR.standardize(net.condition(torch.zeros(3)).sample((4000,), generator=generator(4)))
     assert z.mean(0).abs().max() < 0.2
     torch.testing.assert_close(z.std(0), torch.ones(2), rtol=0, atol=0.1)

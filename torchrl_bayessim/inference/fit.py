@@ -5,20 +5,17 @@ from __future__ import annotations
 __all__ = ["FitReport", "fit", "select_lengthscale", "usable_pairs"]
 
 import copy
-import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
-from tqdm.auto import tqdm
 
 from ..errors import SimulationError, message
 from ..randomness import generator
+from .descent import descend
 from .features import FourierFeatures
-from .losses import PosteriorLoss
 from .posterior import MixtureDensityPosterior
 
 
@@ -81,12 +78,12 @@ def fit(
     posterior: MixtureDensityPosterior,
     data: TensorDictBase,
     *,
-    epochs: int = 300,
+    epochs: int = 60,
     batch_size: int = 128,
-    lr: float = 5e-3,
+    lr: float = 1e-2,
     weight_decay: float = 1e-4,
     validation_fraction: float = 0.1,
-    patience: int = 30,
+    patience: int = 20,
     rescale: bool = True,
     seed: int = 0,
     progress: bool = True,
@@ -95,18 +92,19 @@ def fit(
 
     If the posterior was made with an ``in_key`` or ``out_key``, the pairs' entries are those.
 
-    Adam with a cosine learning rate; after every epoch the loss on held-out pairs is computed, and
-    the parameters of the best epoch are kept. Pairs that are not finite are dropped and counted.
+    AdamW with one cycle of the learning rate: see :mod:`.descent`. After every epoch the loss on
+    held-out pairs is computed, and the parameters of the best epoch are kept. Pairs that are not
+    finite are dropped and counted.
 
     Args:
         posterior: Changed in place.
         data: Batch size ``(N,)``; ``"theta"`` ``(N, D)``, ``"summary"`` ``(N, L)``.
         epochs: At most so many passes.
         batch_size: Pairs per step.
-        lr: Initial learning rate.
+        lr: Highest learning rate.
         weight_decay: Of AdamW.
         validation_fraction: Share of the pairs that is held out: at least one, all but two at most.
-        patience: Stop after so many epochs without improvement.
+        patience: Epochs without improvement after which it stops: see :func:`.descent.descend`.
         rescale: Whether to set the input scaling from these pairs (yes on the first fit).
         seed: Of the split and of the minibatches.
         progress: Whether to show a progress bar.
@@ -132,7 +130,7 @@ def fit(
     validation, train = pairs[order[:held_out]], pairs[order[held_out:]].contiguous()
     if rescale:
         posterior.network.standardize_inputs(train.get(posterior.summary_key))
-    trace = _descend(
+    trace = descend(
         posterior,
         train,
         validation,
@@ -169,64 +167,6 @@ def _check_pairs(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> N
                 f"parameters inside the prior {posterior.prior!r}",
                 f"{int(outside.sum())} outside it, the first {theta[row].tolist()}",
                 hint="the prior that the parameters were drawn from",
-            )
-        )
-
-
-def _descend(
-    posterior: MixtureDensityPosterior,
-    train: TensorDictBase,
-    validation: TensorDictBase,
-    *,
-    epochs: int,
-    batch_size: int,
-    lr: float,
-    weight_decay: float,
-    patience: int,
-    seed: int,
-    progress: bool,
-) -> tuple[list[float], list[float]]:
-    loss_module = PosteriorLoss(posterior)
-    loss_module.set_keys(theta=posterior.theta_key)
-    optimizer = torch.optim.AdamW(posterior.parameters(), lr=lr, weight_decay=weight_decay)
-    batches = math.ceil(len(train) / batch_size)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs * batches)
-    shuffle = generator(seed, "minibatches")
-    best, best_state, stale = math.inf, copy.deepcopy(posterior.state_dict()), 0
-    losses: tuple[list[float], list[float]] = ([], [])
-    bar = tqdm(range(epochs), desc="fit", disable=not progress, leave=False, unit="epoch")
-    for _ in bar:
-        total = 0.0
-        for rows in torch.randperm(len(train), generator=shuffle).chunk(batches):
-            loss = loss_module(train[rows])["loss_posterior"]
-            _check_loss(loss)
-            optimizer.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(posterior.parameters(), 10.0)
-            optimizer.step()
-            schedule.step()
-            total += loss.item() * len(rows) / len(train)
-        with torch.no_grad():
-            held_out = loss_module(validation)["loss_posterior"].item()
-        losses[0].append(total)
-        losses[1].append(held_out)
-        bar.set_postfix(train=f"{total:.2f}", held_out=f"{held_out:.2f}")
-        stale += 1
-        if held_out < best - 1e-4:
-            best, best_state, stale = held_out, copy.deepcopy(posterior.state_dict()), 0
-        if stale >= patience:
-            break
-    posterior.load_state_dict(best_state)
-    return losses
-
-
-def _check_loss(loss: Tensor) -> None:
-    if not loss.isfinite():
-        raise SimulationError(
-            message(
-                "a finite loss",
-                loss.item(),
-                hint="a smaller learning rate, or fewer constant or redundant statistics",
             )
         )
 

@@ -66,15 +66,17 @@ def component_log_prob(value: Tensor, loc: Tensor, scale_tril: Tensor) -> Tensor
         Log-densities of shape ``(*, K)``.
     """
     centred = value.unsqueeze(-2) - loc
-    shape = torch.broadcast_shapes(centred.shape[:-1], scale_tril.shape[:-2])
-    noise = torch.linalg.solve_triangular(
-        scale_tril.expand(*shape, *scale_tril.shape[-2:]),
-        centred.expand(*shape, -1).unsqueeze(-1),
-        upper=False,
-    ).squeeze(-1)
+    # forward substitution by hand: a library call per matrix costs more where D is small
+    noise: list[Tensor] = []
+    for d in range(loc.shape[-1]):
+        rest = centred[..., d]
+        if noise:
+            rest = rest - (scale_tril[..., d, :d] * torch.stack(noise, -1)).sum(-1)
+        noise.append(rest / scale_tril[..., d, d])
+    square = torch.stack(noise, -1).square().sum(-1)
     log_volume = scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     normaliser = 0.5 * loc.shape[-1] * math.log(2 * math.pi)
-    return -0.5 * noise.square().sum(-1) - log_volume - normaliser
+    return -0.5 * square - log_volume - normaliser
 
 
 def moment_match(mixture: Mixture) -> tuple[Tensor, Tensor]:

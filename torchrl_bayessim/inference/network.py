@@ -16,6 +16,7 @@ from .mixtures import Mixture
 Covariance = Literal["diagonal", "full"]
 WIDEST = 4.0  # of a component, in prior deviations: nearly flat over a box, which spans 3.5
 STEEPEST = 100.0  # ratio of a marginal to a conditional deviation
+LINEAR = 3.0  # deviations within which compression changes little
 FLOOR = 1e-8  # of a variance, in standardised coordinates: a deviation of 1e-4 prior deviations
 
 
@@ -101,7 +102,9 @@ class MixtureDensityNetwork(nn.Module):
                 message(f"summaries of shape (*, {len(self.shift)})", tuple(summary.shape))
             )
         scaled = (summary - self.shift) / self.scale
-        return (scaled.asinh() if self.compress else scaled).to(self.shift.dtype)
+        if self.compress:
+            scaled = LINEAR * (scaled / LINEAR).asinh()
+        return scaled.to(self.shift.dtype)
 
     def forward(self, summary: Tensor) -> Mixture:
         """Return the mixture for summaries ``(*, L)``."""

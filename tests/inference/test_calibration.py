@@ -1,0 +1,120 @@
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_bayessim.inference.calibration import calibrate, calibrate_draws
+from torchrl_bayessim.inference.fit import fit
+from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
+from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
+from torchrl_bayessim.randomness import generator
+
+N, DRAWS = 600, 200
+NAMES = ("a", "b")
+
+
+def gaussian_problem(*, width=1.0, shift=0.0, ignore=False):
+    """theta ~ N(0, 1), x = theta + N(0, 0.5^2): the posterior is known; here with an error."""
+    g = generator("gaussian problem")
+    theta = torch.randn(N, 2, generator=g)
+    x = theta + 0.5 * torch.randn(N, 2, generator=g)
+    precision = 1 + 4.0
+    mean, sd = 4 * x / precision + shift, precision**-0.5
+    if ignore:
+        mean, sd = torch.zeros_like(mean), 1.0
+    posterior = torch.distributions.Normal(mean, width * sd)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        draws = posterior.sample((DRAWS,))
+    log_prob = (posterior.log_prob(theta).sum(-1), posterior.log_prob(draws).sum(-1))
+    return calibrate_draws(NAMES, theta, draws, log_prob=log_prob)
+
+
+def test_the_exact_posterior_passes():
+    found = gaussian_problem()
+    assert found.passed
+    assert found.doubts() == []
+    for level in (0.5, 0.9):
+        low, high = found.band(level, confidence=0.99)
+        assert low < level < high
+        for name, share in found.coverage(level).items():
+            assert low <= share <= high, name
+
+
+@pytest.mark.parametrize(("width", "said"), [(0.6, "too sure"), (1.7, "not sure enough")])
+def test_a_posterior_of_the_wrong_width_fails(width, said):
+    found = gaussian_problem(width=width)
+    assert not found.passed
+    (doubt,) = found.doubts()
+    assert f"the posterior is {said}" in doubt
+    low, high = found.band(0.5)
+    assert not any(low <= share <= high for share in found.coverage(0.5).values())
+
+
+def test_a_biased_posterior_shows_in_the_ranks():
+    found = gaussian_problem(shift=0.3)
+    assert found.p_values()["rank of a"] < 1e-6
+    assert not found.passed
+
+
+def test_a_posterior_that_ignores_the_data_is_calibrated_all_the_same():
+    """Which is why nats stand beside coverage."""
+    assert gaussian_problem(ignore=True).passed
+
+
+def test_the_band_is_the_binomial_s():
+    low, high = gaussian_problem().band(0.9)
+    assert low == pytest.approx(0.9 - 1.96 * (0.9 * 0.1 / N) ** 0.5, abs=0.004)
+    assert high == pytest.approx(0.9 + 1.96 * (0.9 * 0.1 / N) ** 0.5, abs=0.004)
+
+
+def linear_pairs(prior, count, key):
+    g = generator(key)
+    theta = prior.sample((count,), generator=g)
+    noise = torch.tensor([0.1, 0.4]) * torch.randn(count, 2, generator=g)
+    return TensorDict({"theta": theta, "summary": theta + noise}, [count])
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [BoxPrior({"a": (0.0, 1.0), "b": (-1.0, 1.0)}), GaussianPrior({"a": (0, 1), "b": (0, 1)})],
+    ids=["box", "gaussian"],
+)
+def test_a_network_fitted_to_enough_pairs_passes(prior):
+    posterior = MixtureDensityPosterior(prior, 2)
+    fit(posterior, linear_pairs(prior, 2000, "train"), epochs=20, progress=False)
+    found = calibrate(posterior, linear_pairs(prior, 400, "test"), draws=100)
+    assert found.passed, found.p_values()
+
+
+def test_a_network_whose_deviations_are_too_small_fails():
+    prior = BoxPrior({"a": (0.0, 1.0), "b": (-1.0, 1.0)})
+    posterior = MixtureDensityPosterior(prior, 2, components=1)
+    fit(posterior, linear_pairs(prior, 500, "train"), epochs=15, progress=False)
+    variances = slice(3, 5)
+    with torch.no_grad():
+        posterior.network.head.bias[variances] -= 2.0
+    found = calibrate(posterior, linear_pairs(prior, 200, "test"), draws=100)
+    assert not found.passed
+    assert "too sure" in found.doubts()[0]
+
+
+def test_the_same_seed_gives_the_same_shares():
+    prior = BoxPrior({"a": (0.0, 1.0), "b": (-1.0, 1.0)})
+    posterior, pairs = MixtureDensityPosterior(prior, 2), linear_pairs(prior, 70, "test")
+    before = torch.random.get_rng_state()
+    first, again = (calibrate(posterior, pairs, draws=20) for _ in range(2))
+    assert torch.equal(first.rank, again.rank)
+    assert torch.equal(first.density, again.density)
+    assert torch.equal(first.distance, again.distance)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert first.rank.shape == (70, 2)
+
+
+def test_draws_of_another_shape_are_refused():
+    with pytest.raises(ValueError, match=r"draws of shape .* got \(5, 3, 2\)"):
+        calibrate_draws(
+            NAMES,
+            torch.zeros(4, 2),
+            torch.zeros(5, 3, 2),
+            log_prob=(torch.zeros(4), torch.zeros(5, 4)),
+        )

@@ -1,0 +1,69 @@
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_bayessim.inference.descent import _one_cycle, descend
+from torchrl_bayessim.inference.losses import PosteriorLoss
+from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
+from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
+from torchrl_bayessim.randomness import generator
+
+OPTIONS = {
+    "batch_size": 32,
+    "lr": 1e-2,
+    "weight_decay": 0.0,
+    "patience": 100,
+    "seed": 0,
+    "progress": False,
+}
+
+
+def pairs(prior, count, key=0):
+    theta = prior.sample((count,), generator=generator("theta", key))
+    noise = 0.3 * torch.randn(count, 2, generator=generator("noise", key))
+    return TensorDict({"theta": theta, "summary": theta + noise}, [count])
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        BoxPrior({"a": (0.0, 1.0), "b": (0.1, 2.0)}, log=["b"]),
+        GaussianPrior({"a": (0, 1), "b": (5, 2)}),
+    ],
+    ids=["box", "gaussian"],
+)
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("covariance", ["full", "diagonal"])
+def test_the_loss_reported_is_that_of_the_loss_module(prior, weighted, covariance):
+    net = MixtureDensityPosterior(prior, 2, covariance=covariance)
+    train, held = pairs(prior, 64), pairs(prior, 40, key=1)
+    if weighted:
+        train["weight"], held["weight"] = torch.ones(64), torch.arange(40.0)
+    _, validation = descend(net, train, held, epochs=3, **OPTIONS)
+    with torch.no_grad():
+        expected = PosteriorLoss(net)(held)["loss_posterior"].item()
+    assert min(validation) == pytest.approx(expected, abs=1e-4)
+
+
+def test_the_box_comes_in_before_the_end():
+    """Summaries that say nothing: the posterior is flat to its edges, the entropy 0."""
+    prior = BoxPrior({"a": (0.0, 1.0)})
+    theta = prior.sample((3000,), generator=generator(1))
+    data = TensorDict({"theta": theta, "summary": torch.zeros(3000, 2)}, [3000])
+    net = MixtureDensityPosterior(prior, 2, components=1)
+    descend(net, data[:1500], data[1500:], epochs=12, **OPTIONS)
+    density = net.distribution(torch.zeros(2)).log_prob(torch.tensor([[0.0], [0.5], [1.0]]))
+    assert density.abs().max() < 0.15
+
+
+def test_the_learning_rate_rises_once_and_falls_to_nothing():
+    rates = [_one_cycle(step, 200) for step in range(200)]
+    top = rates.index(max(rates))
+    assert top == 20
+    assert max(rates) == pytest.approx(1.0)
+    assert rates[:top] == sorted(rates[:top])
+    assert rates[top:] == sorted(rates[top:], reverse=True)
+    assert rates[-1] < 1e-3
+    assert all(math.isfinite(_one_cycle(step, 1)) for step in range(3))

@@ -1,0 +1,187 @@
+r"""Is a posterior as sure as it may be? Answers from simulations whose parameters are known.
+
+If :math:`\theta_i \sim p(\theta)`, :math:`x_i \sim p(x \mid \theta_i)` and the posterior is right,
+then each of these shares of its draws is uniform on [0, 1]:
+
+* **rank**, per parameter: draws below the truth (simulation-based calibration, Talts et al., 2018,
+  arXiv:1804.06788);
+* **density**: draws of a higher density than the truth has. The truth lies in the highest-density
+  region of level c in a share c of the cases: expected coverage (Hermans et al., 2022,
+  arXiv:2110.06581);
+* **distance**: draws nearer to a random point than the truth is (TARP, Lemos et al., 2023,
+  arXiv:2302.03026). The points must depend on the data, or a posterior that ignores them passes;
+  here they are scattered around the posterior's mean.
+
+A posterior that is too sure has ranks at both ends and truths outside its regions.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Calibration", "calibrate", "calibrate_draws"]
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from scipy.stats import binom, kstest
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from ..errors import message
+from ..randomness import generator
+from .posterior import MixtureDensityPosterior
+
+_LEVEL = 0.01  # chance that a right posterior fails, over all tests together
+_ROWS = 64  # test cases whose draws are made at a time
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Where the truths lie in their posteriors; see the module.
+
+    Attributes:
+        names: The parameters' names.
+        rank: Shape ``(N, D)``.
+        density: Shape ``(N,)``.
+        distance: Shape ``(N,)``.
+    """
+
+    names: tuple[str, ...]
+    rank: Tensor
+    density: Tensor
+    distance: Tensor
+
+    def coverage(self, level: float) -> dict[str, float]:
+        """Return how often regions of this level hold the truth, by parameter and ``"joint"``.
+
+        Central intervals for single parameters, highest-density regions for all together.
+        """
+        central = ((self.rank - 0.5).abs() <= level / 2).double().mean(0).tolist()
+        joint = (self.density <= level).double().mean().item()
+        return dict(zip(self.names, central, strict=True)) | {"joint": joint}
+
+    def band(self, level: float, *, confidence: float = 0.95) -> tuple[float, float]:
+        """Return the interval in which the coverage of a right posterior falls so often."""
+        low, high = binom.interval(confidence, len(self.rank), level)
+        return float(low) / len(self.rank), float(high) / len(self.rank)
+
+    def p_values(self) -> dict[str, float]:
+        """Return a Kolmogorov-Smirnov p-value per share: small ones say that it is not uniform."""
+        columns = {f"rank of {n}": self.rank[:, d] for d, n in enumerate(self.names)}
+        columns |= {"density": self.density, "distance": self.distance}
+        return {name: float(kstest(u.numpy(), "uniform").pvalue) for name, u in columns.items()}
+
+    @property
+    def passed(self) -> bool:
+        """Whether no test rejects uniformity, at 1 % over all tests together (Bonferroni)."""
+        p = self.p_values()
+        return min(p.values()) > _LEVEL / len(p)
+
+    def doubts(self) -> list[str]:
+        """Return one sentence if the test fails, none otherwise."""
+        if self.passed:
+            return []
+        inner, outer = (self.coverage(level) for level in (0.5, 0.9))
+        worst = min(self.p_values().items(), key=lambda item: item[1])
+        sure = "too sure" if outer["joint"] < 0.9 else "not sure enough, or biased"
+        return [
+            f"the posterior is {sure}: of {len(self.rank)} known truths its 50 % and 90 % regions "
+            f"hold {inner['joint']:.0%} and {outer['joint']:.0%} ({worst[0]}: p = {worst[1]:.1g}). "
+            "Try more simulations, or the average of several networks."
+        ]
+
+
+def calibrate_draws(
+    names: tuple[str, ...],
+    theta: Tensor,
+    draws: Tensor,
+    *,
+    log_prob: tuple[Tensor, Tensor],
+    seed: int = 0,
+) -> Calibration:
+    """Return the calibration of any posterior from its draws.
+
+    Args:
+        names: The parameters' names.
+        theta: Truths, shape ``(N, D)``.
+        draws: Posterior draws for each, shape ``(S, N, D)``.
+        log_prob: The posterior's log-density at the truths, ``(N,)``, and at the draws, ``(S, N)``.
+        seed: Of the points that distances are measured from.
+
+    Example:
+        >>> truths, draws = torch.randn(300, 1), torch.randn(200, 300, 1)
+        >>> log_prob = (-truths[..., 0]**2, -draws[..., 0]**2)
+        >>> calibrate_draws(("a",), truths, draws, log_prob=log_prob).passed
+        True
+    """
+    if theta.ndim != 2 or draws.shape[1:] != theta.shape or len(draws) < 2:
+        raise ValueError(
+            message(
+                f"draws of shape (S >= 2, N, D) for truths of shape {tuple(theta.shape)}",
+                tuple(draws.shape),
+            )
+        )
+    theta, draws = theta.double(), draws.double()
+    jitter = torch.rand(3, len(theta), 1, generator=generator(seed, "ties"), dtype=theta.dtype)
+
+    def share(below: Tensor, noise: Tensor) -> Tensor:
+        # among S draws the truth has S + 1 places; spread evenly within its own
+        return (below.double().sum(0) + noise) / (len(draws) + 1)
+
+    spread = torch.cat([theta, draws.flatten(0, 1)]).std(0).clamp_min(1e-12)
+    points = _reference(draws, generator(seed, "points"), spread)
+    away = ((draws - points) / spread).norm(dim=-1)
+    own = ((theta - points) / spread).norm(dim=-1)
+    at_truth, at_draws = log_prob
+    return Calibration(
+        names,
+        share(draws < theta, jitter[0]),
+        share(at_draws > at_truth, jitter[1, :, 0]),
+        share(away < own, jitter[2, :, 0]),
+    )
+
+
+def _reference(draws: Tensor, g: torch.Generator, spread: Tensor) -> Tensor:
+    """Return the posterior's means, pushed at random, shape ``(N, D)``."""
+    push = torch.randn(draws.shape[1:], generator=g, dtype=draws.dtype)
+    return draws.mean(0) + 0.5 * (draws.std(0) + 0.1 * spread) * push
+
+
+@torch.no_grad()
+def calibrate(
+    posterior: MixtureDensityPosterior, pairs: TensorDictBase, *, draws: int = 300, seed: int = 0
+) -> Calibration:
+    """Return the calibration of an amortised posterior.
+
+    Args:
+        posterior: The network.
+        pairs: ``{"theta", "summary"}`` from the prior that it was not trained on, batch size
+            ``(N,)``. A few hundred tell 90 % from 85 %.
+        draws: Posterior draws per pair.
+        seed: Same seed, same numbers.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_bayessim.inference.priors import BoxPrior
+        >>> prior = BoxPrior({"mass": (2.0, 6.0)})
+        >>> untrained = MixtureDensityPosterior(prior, 2, components=1)
+        >>> data = {"theta": prior.sample((200,)), "summary": torch.zeros(200, 2)}
+        >>> pairs = TensorDict(data, batch_size=[200])
+        >>> sorted(calibrate(untrained, pairs).coverage(0.5))
+        ['joint', 'mass']
+    """
+    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    for index, rows in enumerate(torch.arange(len(pairs)).split(_ROWS)):
+        q: Any = posterior.distribution(pairs["summary"][rows])
+        some = q.sample((draws,), generator=generator(seed, "calibration", index))
+        found.append((some, q.log_prob(pairs["theta"][rows]), q.log_prob(some)))
+    drawn, at_truth, at_draws = (
+        torch.cat(part, -1 if part[0].ndim < 3 else 1) for part in zip(*found, strict=True)
+    )
+    return calibrate_draws(
+        posterior.prior.names,
+        pairs["theta"],
+        drawn,
+        log_prob=(at_truth, at_draws),
+        seed=seed,
+    )

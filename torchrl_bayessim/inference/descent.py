@@ -1,0 +1,154 @@
+r"""How a posterior's loss goes down: one cycle of the learning rate, the box in the last part only.
+
+The mass :math:`Z_k \leq 1` of a component inside the prior's box costs most of a step to compute.
+As :math:`\log(N_k / Z_k) \geq \log N_k`, the loss of the mixture before truncation bounds the loss
+from above, and its minimum is near: the descent begins with it and ends with the loss itself.
+"""
+
+from __future__ import annotations
+
+__all__ = ["descend"]
+
+import copy
+import math
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from ..errors import SimulationError, message
+from ..randomness import generator
+from .posterior import TRAINING_POINTS, MixtureDensityPosterior
+from .truncation import TruncatedGaussianMixture
+
+_WARM_UP = 0.1  # share of the steps in which the learning rate rises
+_FREE = 0.5  # share of the epochs that do without the box
+_CLIP = 10.0  # of the gradient's norm
+
+
+class _Pairs(NamedTuple):
+    summary: Tensor
+    z: Tensor
+    volume: Tensor
+    weight: Tensor
+
+
+def descend(
+    posterior: MixtureDensityPosterior,
+    train: TensorDictBase,
+    validation: TensorDictBase,
+    *,
+    epochs: int,
+    batch_size: int,
+    lr: float,
+    weight_decay: float,
+    patience: int,
+    seed: int,
+    progress: bool,
+) -> tuple[list[float], list[float]]:
+    """Leave the posterior with the parameters of its best epoch; return the losses per epoch.
+
+    Args:
+        posterior: Changed in place.
+        train: Pairs to learn from.
+        validation: Pairs that say which epoch is the best.
+        epochs: At most so many passes.
+        batch_size: Pairs per step.
+        lr: Highest learning rate.
+        weight_decay: Of AdamW.
+        patience: Epochs without improvement after which the box comes in, and then the end.
+        seed: Of the minibatches.
+        progress: Whether to show a progress bar.
+
+    Raises:
+        SimulationError: The loss is not finite.
+    """
+    pairs, held = _prepared(posterior, train), _prepared(posterior, validation)
+    everything = torch.arange(len(held.z))
+    batches = math.ceil(len(train) / batch_size)
+    steps = epochs * batches
+    optimizer = torch.optim.AdamW(
+        posterior.parameters(), lr=lr, weight_decay=weight_decay, fused=True
+    )
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _one_cycle(step, steps))
+    shuffle = generator(seed, "minibatches")
+    best, best_state, stale = math.inf, copy.deepcopy(posterior.state_dict()), 0
+    truncated = posterior.prior.box is None
+    losses: tuple[list[float], list[float]] = ([], [])
+    bar = tqdm(range(epochs), desc="fit", disable=not progress, leave=False, unit="epoch")
+    for epoch in bar:
+        if not truncated and (epoch >= _FREE * epochs or stale >= patience):
+            truncated, stale = True, 0
+        total = 0.0
+        for rows in torch.randperm(len(train), generator=shuffle).chunk(batches):
+            loss = _loss(posterior, pairs, rows, truncated=truncated)
+            _check_loss(loss)
+            optimizer.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(posterior.parameters(), _CLIP)
+            optimizer.step()
+            schedule.step()
+            total += loss.item() * len(rows) / len(train)
+        with torch.no_grad():
+            held_out = _loss(posterior, held, everything, truncated=True).item()
+        losses[0].append(total)
+        losses[1].append(held_out)
+        bar.set_postfix(train=f"{total:.2f}", held_out=f"{held_out:.2f}")
+        stale += 1
+        if held_out < best - 1e-4:
+            best, best_state, stale = held_out, copy.deepcopy(posterior.state_dict()), 0
+        if truncated and stale >= patience:
+            break
+    posterior.load_state_dict(best_state)
+    return losses
+
+
+def _one_cycle(step: int, steps: int) -> float:
+    """Return the share of the highest learning rate: a short rise, then half a cosine to 0."""
+    rise = max(1.0, _WARM_UP * steps)
+    if step < rise:
+        return 0.1 + 0.9 * step / rise
+    return 0.5 * (1 + math.cos(math.pi * min(1.0, (step - rise) / max(1.0, steps - rise))))
+
+
+def _prepared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> _Pairs:
+    """Return what does not change from epoch to epoch."""
+    theta = pairs.get(posterior.theta_key).double()
+    z = posterior.prior.standardize(theta)
+    volume = posterior.prior.standardization.log_abs_det_jacobian(z, theta)
+    weight = pairs.get("weight", None)
+    weight = z.new_ones(len(z)) if weight is None else weight.reshape(len(z)).double()
+    return _Pairs(pairs.get(posterior.summary_key), z, volume, weight)
+
+
+def _loss(
+    posterior: MixtureDensityPosterior, pairs: _Pairs, rows: Tensor, *, truncated: bool
+) -> Tensor:
+    """Return the weighted negative log-density in nats, as `PosteriorLoss` does."""
+    network = posterior.network
+    logits, loc, scale_tril = network(pairs.summary[rows])
+    mixture = TruncatedGaussianMixture(
+        logits,
+        loc,
+        scale_tril,
+        posterior.prior.box if truncated else None,
+        diagonal=network.covariance == "diagonal",
+        points=TRAINING_POINTS,
+    )
+    weight = pairs.weight[rows]
+    loss = pairs.volume[rows] - mixture.log_prob(pairs.z[rows])
+    total = torch.where(weight > 0, weight * loss, 0.0).sum()
+    return total / weight.sum().clamp_min(1e-12)
+
+
+def _check_loss(loss: Tensor) -> None:
+    if not loss.isfinite():
+        raise SimulationError(
+            message(
+                "a finite loss",
+                loss.item(),
+                hint="a smaller learning rate, or fewer constant or redundant statistics",
+            )
+        )
