@@ -4,7 +4,7 @@ import pytest
 
 from torchrl_bayessim.envs.model_batch import ModelBatch
 from torchrl_bayessim.envs.stepper import Stepper
-from torchrl_bayessim.errors import PhysicsError
+from torchrl_bayessim.errors import PhysicsError, SimulationError
 
 ARM = """
 <mujoco>
@@ -187,3 +187,12 @@ def test_repeated_physics_keep_their_columns():
     again = models.repeated(3)
     again.refresh()
     np.testing.assert_array_equal(again.table, np.repeat(models.table, 3, axis=0))
+
+
+def test_a_model_without_room_to_be_evaluated_is_refused():
+    """Where MuJoCo's fatal error would end the process from compiled code."""
+    box = "<body pos='{} 0 .1'><freejoint/><geom type='box' size='.1 .1 .1'/></body>"
+    boxes = "".join(box.format(0.05 * i) for i in range(12))
+    crowded = f"<mujoco><size memory='8K'/><worldbody>{boxes}</worldbody></mujoco>"
+    with pytest.raises(SimulationError, match=r"with room for its computations.*stack overflow"):
+        Stepper(mujoco.MjModel.from_xml_string(crowded), 2)

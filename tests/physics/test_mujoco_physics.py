@@ -323,3 +323,47 @@ def test_friction_of_both_geoms_is_the_friction_of_their_contact(name):
         between = (bodies == table).any(1) & (bodies == fetch.model.body("object0").id).any(1)
         assert between.any()
         np.testing.assert_allclose(fetch.data.contact.friction[between, 0], friction, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("target", "moved"),
+    [
+        ("body_ipos[torso,0]", "xipos"),
+        ("geom_pos[torso_geom,0]", "geom_xpos"),
+    ],
+)
+def test_a_frame_that_coincides_with_its_body_s_can_be_moved(target, moved):
+    """MuJoCo ignores the place of such a frame until it is told that it moved."""
+    env = TransformedEnv(GymEnv("Hopper-v5"), ApplyPhysics(MujocoPhysics(target)))
+    model, data = env.unwrapped.model, env.unwrapped.data
+    assert model.body("torso").sameframe or model.geom("torso_geom").sameframe
+    mujoco.mj_forward(model, data)
+    before = getattr(data, moved).copy()
+    env.reset(env.full_state_spec.zero().set("theta", torch.tensor([0.1])))
+    data.qpos[:] = model.qpos0
+    mujoco.mj_forward(model, data)
+    shift = np.abs(getattr(data, moved) - before).max()
+    assert shift > 0.05
+
+
+def test_moving_a_centre_of_mass_does_the_same_in_one_environment_and_in_a_batch():
+    physics, theta = MujocoPhysics("body_ipos[torso,0]"), torch.tensor([[0.1], [0.1]])
+    batch = TransformedEnv(BatchedMujocoEnv("Hopper-v5", 2), ApplyPhysics(physics))
+    batch.reset(batch.full_state_spec.zero().set("theta", theta))
+    single = TransformedEnv(GymEnv("Hopper-v5"), ApplyPhysics(physics))
+    single.reset(single.full_state_spec.zero().set("theta", theta[0]))
+    copy, own = batch.base_env.models.copy_of(0), single.unwrapped.model
+    for name in ("body_ipos", "body_invweight0", "dof_M0"):
+        np.testing.assert_allclose(getattr(copy, name), getattr(own, name), rtol=1e-12)
+    ends = []
+    for model in (copy, own):
+        data = mujoco.MjData(model)
+        mujoco.mj_step(model, data, nstep=20)
+        ends.append(data.qpos)
+    # short cuts for a frame that is only shifted change the order of operations
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-10)
+
+
+def test_a_centre_of_mass_that_mujoco_fixes_at_the_origin_cannot_be_moved():
+    with pytest.raises(PhysicsError, match="a body whose centre of mass is not at its origin"):
+        write(arm(), MujocoPhysics("body_ipos[ball,0]"), 0.1)

@@ -114,6 +114,9 @@ class Stepper:
         sharing: How many consecutive simulations share one physics; it divides ``N``.
         threads: Threads to step with; default all cores that this process may use.
 
+    Raises:
+        SimulationError: The model has too little memory to be evaluated at all.
+
     Attributes:
         models: The physics of each simulation.
         state: States, shape ``(N, S)``.
@@ -148,7 +151,9 @@ class Stepper:
         self.components = _components(model, welded=drive.weld is not None)
         self.initial = np.zeros(max(part.stop for part in self.components.values()))
         size = mujoco.mj_stateSize(model, _SIGNATURE)
-        mujoco.mj_getState(model, mujoco.MjData(model), self.initial[:size], _SIGNATURE)
+        data = mujoco.MjData(model)
+        mujoco.mj_getState(model, data, self.initial[:size], _SIGNATURE)
+        _try_out(model, data)
         self.models = ModelBatch(model, num_envs // sharing, threads=threads)
         self.resize(num_envs)
 
@@ -248,6 +253,20 @@ class Stepper:
         kernel(*calls[0])
         for future in futures:
             future.result()
+
+
+def _try_out(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Evaluate the model once from Python, where a fatal error of MuJoCo is an exception.
+
+    In compiled code it would end the process.
+    """
+    data.warning.number[:] = 1  # MuJoCo prints a warning only while its count is zero
+    try:
+        mujoco.mj_forward(model, data)
+    except mujoco.FatalError as error:
+        expected = "a model with room for its computations"
+        hint = "raise <size memory='…'/> in the MJCF"
+        raise SimulationError(message(expected, str(error).split("\n")[0], hint=hint)) from None
 
 
 def _resolve(
