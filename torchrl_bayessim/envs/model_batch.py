@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PhysicsError, message
+from ..physics.frames import separate
 from . import native
 
 # What mj_setConst derives from masses, inertias and geometry (engine_setconst.c); the visual
@@ -49,15 +50,6 @@ _SCALARS = {
     "stat.meaninertia": ("stat.center", -4),
 }
 _SHARE = 8  # environments that are worth another thread
-# Where a frame coincides with its body's (or inertial) frame MuJoCo copies it and ignores these.
-_FRAMES = {
-    "body_ipos": "body_sameframe",
-    "body_iquat": "body_sameframe",
-    "geom_pos": "geom_sameframe",
-    "geom_quat": "geom_sameframe",
-    "site_pos": "site_sameframe",
-    "site_quat": "site_sameframe",
-}
 
 
 def _attribute(model: mujoco.MjModel, field: str) -> Any:
@@ -235,8 +227,8 @@ class ModelBatch:
         The copy is told not to take short cuts that hold for the nominal values only.
         """
         for field, indices in self._columns:
-            if field in _FRAMES:
-                getattr(model, _FRAMES[field])[indices[0]] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+            if indices:
+                separate(model, field, indices[0])
         return np.array([_address(model, *key) for key in self._columns], dtype=np.int64)
 
     def copy_of(self, row: int) -> mujoco.MjModel:

@@ -11,18 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PhysicsError, message
+from .frames import separate
 from .model_fields import Entries
-
-# Where a frame coincides with its body's (or inertial) frame MuJoCo copies it and ignores these.
-_FRAMES = {
-    f"{kind}_{place}": f"{kind}_sameframe"
-    for kind, places in {
-        "body": ("ipos", "iquat"),
-        "geom": ("pos", "quat"),
-        "site": ("pos", "quat"),
-    }.items()
-    for place in places
-}
 
 
 class MujocoModels:
@@ -63,8 +53,8 @@ class MujocoModels:
             self._batch.write(field, indices, values, rows)
         elif rows.all():
             self.nominal(field, indices)
-            if field in _FRAMES:
-                _separate(self.model, field, indices[0])
+            if indices:
+                _let_move(self.model, field, indices[0])
             if indices:
                 _array(self.model, field)[indices] = values[0]
             else:
@@ -116,10 +106,9 @@ def _model(env: Any) -> mujoco.MjModel:
     return model
 
 
-def _separate(model: mujoco.MjModel, field: str, row: int) -> None:
-    """Let a frame move: MuJoCo ignores the place of one that coincides with its body's."""
+def _let_move(model: mujoco.MjModel, field: str, row: int) -> None:
     if field in ("body_ipos", "body_iquat") and model.body_simple[row]:
         hint = "give the body simple='false' in the MJCF"
         expected = "a body whose centre of mass is not at its origin, to move it"
         raise PhysicsError(message(expected, model.body(row).name, hint=hint))
-    getattr(model, _FRAMES[field])[row] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    separate(model, field, row)
