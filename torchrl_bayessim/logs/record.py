@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["Record", "record_of"]
+__all__ = ["Record", "record_of", "unwrapped", "wraps"]
 
 from dataclasses import dataclass
 
@@ -80,3 +80,24 @@ def _continuous(quaternions: Array, file: str, joint: str) -> Array:
     turns = np.nan_to_num((unit[1:] * unit[:-1]).sum(1), nan=1.0)
     signs = np.cumprod(np.concatenate([[1.0], np.where(turns < 0, -1.0, 1.0)]))
     return unit * signs[:, None]
+
+
+def wraps(angle: Array) -> NDArray[np.bool_]:
+    """Return after which rows an angle jumps by a turn, which no motion does, shape ``(T - 1,)``.
+
+    Example:
+        >>> wraps(np.array([3.0, 3.1, -3.1, -3.0])).tolist()
+        [False, True, False]
+    """
+    return np.abs(np.abs(np.diff(angle)) - 2 * np.pi) < 1.5
+
+
+def unwrapped(angle: Array) -> Array:
+    """Return an angle without jumps of a turn.
+
+    Example:
+        >>> unwrapped(np.array([3.0, 3.1, -3.1, -3.0])).round(3).tolist()
+        [3.0, 3.1, 3.183, 3.283]
+    """
+    turns = np.where(wraps(angle), np.sign(np.diff(angle)), 0.0)
+    return angle - 2 * np.pi * np.concatenate([[0.0], np.cumsum(turns)])

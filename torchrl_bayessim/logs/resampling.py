@@ -3,8 +3,8 @@ r"""From records at their own times to logs at the control step.
 Between two rows positions follow the cubic that meets both positions and velocities (Hermite),
 rotations the same in the tangent space of the first row; velocities are interpolated linearly; the
 action of a step is the average over it of the actions held. A record that already is on the grid,
-to within a fiftieth of a step, is taken as it is. It is split where rows are left out or not
-finite, and at gaps, across which nothing is invented.
+to within a fiftieth of a step, is taken as it is. Jumps of hinges by a turn are undone. A record is
+split where rows are left out or not finite, and at gaps, across which nothing is invented.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import message
 from .columns import joint_names
 from .log import Log
-from .record import Record
+from .record import Record, unwrapped
 from .system import System
 from .velocity import Windows, angular_velocity, velocity
 
@@ -83,6 +83,8 @@ def _parts(record: Record, system: System, leave_out: Iterable[tuple[int, int]])
 def _resampled(record: Record, rows: slice, system: System, split: bool) -> Log | None:  # noqa: FBT001
     model = system.task.model
     time, qpos, ctrl = record.time[rows], record.qpos[rows].copy(), record.ctrl[rows]
+    for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE):
+        qpos[:, model.jnt_qposadr[j]] = unwrapped(qpos[:, model.jnt_qposadr[j]])
     qvel, gain, margin = _velocities(time, qpos, record.qvel[rows], system)
     if qvel is None or len(time) - 2 * margin < 2:
         return None

@@ -14,6 +14,7 @@ from __future__ import annotations
 __all__ = ["Windows", "angular_velocity", "velocity"]
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,8 @@ class Windows:
     """
 
     def __init__(self, time: Array) -> None:
-        self._time = time
+        self._time, self._step = time, np.diff(time).mean()
+        self._even = bool(np.abs(np.diff(time) - self._step).max() <= 0.02 * self._step)
         self._fits: dict[int, tuple[Rows, Array, Array]] = {}
 
     @property
@@ -47,12 +49,13 @@ class Windows:
             count, width = len(self._time), 2 * half + 1
             first = np.clip(np.arange(count) - half, 0, count - width)
             rows = first[:, None] + np.arange(width)
-            offset = self._time[rows] - self._time[:, None]
-            scale = np.abs(offset).max(1, keepdims=True)
-            powers = (offset / scale)[..., None] ** np.arange(4)
-            transposed = powers.transpose(0, 2, 1)
-            weights = np.linalg.solve(transposed @ powers, transposed)
-            self._fits[half] = rows, weights[:, 0], weights[:, 1] / scale
+            if self._even:  # all windows alike: only the place of the row in its window matters
+                own = np.arange(count) - first
+                smooth, slope = _weights(np.arange(width) - np.arange(width)[:, None])
+                smooth, slope = smooth[own], slope[own] / self._step
+            else:
+                smooth, slope = _weights(self._time[rows] - self._time[:, None])
+            self._fits[half] = rows, smooth, slope
         return self._fits[half]
 
 
@@ -95,6 +98,15 @@ def angular_velocity(windows: Windows, quaternion: Array) -> tuple[Array, float,
 
     slope, gain, half = _fitted(windows, near)
     return slope.T, gain, half
+
+
+def _weights(offset: NDArray[Any]) -> tuple[Array, Array]:
+    """Return weights of value and slope at offset 0, from windows of offsets, ``(N, w)``."""
+    scale = np.abs(offset).max(1, keepdims=True)
+    powers = (offset / scale)[..., None] ** np.arange(4)
+    transposed = powers.transpose(0, 2, 1)
+    weights = np.linalg.solve(transposed @ powers, transposed)
+    return weights[:, 0], weights[:, 1] / scale
 
 
 def _fitted(windows: Windows, near: Callable[[Rows], Array]) -> tuple[Array, float, int]:

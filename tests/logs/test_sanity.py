@@ -1,0 +1,337 @@
+"""The gate lets clean logs pass, of whatever robot, and names what is spoilt."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from torchrl_bayessim.envs.task import Task
+from torchrl_bayessim.envs.tasks.catalogue import known_task
+from torchrl_bayessim.logs.columns import Columns
+from torchrl_bayessim.logs.finding import Finding
+from torchrl_bayessim.logs.record import Record
+from torchrl_bayessim.logs.sanity import check, usable_logs
+from torchrl_bayessim.logs.simulators import simulator_task
+from torchrl_bayessim.logs.system import System
+from torchrl_bayessim.physics.mujoco import MujocoPhysics
+from torchrl_bayessim.replay import Replay
+
+ARM = """
+<mujoco>
+  <option timestep="0.002"/>
+  <worldbody>
+    <body name="upper">
+      <joint name="shoulder" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="1" contype="0"/>
+      <body name="lower" pos="0 0 -.3">
+        <joint name="elbow" axis="0 1 0" damping="0.1"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".5" contype="0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="m1" joint="shoulder" ctrlrange="-3 3"/>
+    <motor name="m2" joint="elbow" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def arm(xml):
+    """A model at 100 Hz."""
+    return Task(model=mujoco.MjModel.from_xml_string(xml), frame_skip=5)
+
+
+SYSTEMS = {
+    "hopper": (lambda: known_task("Hopper-v5"), "body_mass[torso]"),
+    "arm": (
+        lambda: Task(model=mujoco.MjModel.from_xml_string(ARM), frame_skip=5),
+        "body_mass[upper]",
+    ),
+    "cartpole": (lambda: simulator_task("dm_control:cartpole/swingup", None, None), "body_mass[1]"),
+}
+
+
+def simulated(name, *, count=6, steps=300, noise=(1e-3, 1e-2), seed=0):
+    """Simulate logs under random smooth actions and a mass that is not the nominal one."""
+    make, mass = SYSTEMS[name]
+    task = make()
+    model = task.model
+    rng = np.random.default_rng(seed)
+    low, high = model.actuator_ctrlrange.T
+    knots = rng.uniform(low, high, size=(count, steps // 10 + 1, model.nu))
+    ctrl = 0.8 * knots.repeat(10, axis=1)[:, :steps]
+    start = {
+        "qpos": torch.from_numpy(np.tile(model.qpos0, (count, 1))),
+        "qvel": torch.from_numpy(0.1 * rng.normal(size=(count, model.nv))),
+        "action": torch.from_numpy(ctrl),
+    }
+    theta = 1.3 * torch.tensor([[float(model.body_mass[1])]])
+    out = Replay(task, start, physics=MujocoPhysics(mass), threads=1)(theta)
+    qpos = torch.cat([start["qpos"][:, None], out["qpos"][0]], 1)[:, :steps].numpy()
+    qvel = torch.cat([start["qvel"][:, None], out["qvel"][0]], 1)[:, :steps].numpy()
+    records = [
+        Record(
+            name=f"{i}.csv",
+            time=task.dt * np.arange(steps),
+            qpos=qpos[i] + noise[0] * rng.normal(size=qpos[i].shape),
+            qvel=qvel[i] + noise[1] * rng.normal(size=qvel[i].shape),
+            ctrl=ctrl[i],
+        )
+        for i in range(count)
+    ]
+    return System(task=task), records
+
+
+def kinds(findings, severity="error"):
+    return {finding.kind for finding in findings if finding.severity == severity}
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("noise", [(0.0, 0.0), (1e-3, 1e-2), (1e-2, 2e-1)])
+def test_clean_logs_pass(name, noise):
+    for seed in range(3):
+        system, records = simulated(name, noise=noise, seed=seed)
+        findings = check(records, system)
+        assert not kinds(findings), findings[0]
+        assert kinds(findings, "warning") <= {"range"}
+        assert [len(log) for log in usable_logs(records, system, findings)] == [300] * 6
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_clean_logs_without_velocities_pass(name):
+    system, records = simulated(name)
+    system = System(task=system.task, columns=replace(system.columns, qvel={}))
+    records = [replace(record, qvel=np.full_like(record.qvel, np.nan)) for record in records]
+    findings = check(records, system)
+    assert not kinds(findings), findings[0]
+
+
+def test_quantised_logs_pass():
+    system, records = simulated("arm")
+    rounded = [
+        replace(r, qpos=np.round(r.qpos / 2e-3) * 2e-3, qvel=np.round(r.qvel / 0.05) * 0.05)
+        for r in records
+    ]
+    findings = check(rounded, system)
+    assert not kinds(findings), findings[0]
+
+
+def spoilt(change, *, only=None, name="arm"):
+    """Return findings after ``change(record)`` of all records, or of number ``only``."""
+    system, records = simulated(name)
+    records = [change(r) if only in (None, i) else r for i, r in enumerate(records)]
+    return check(records, system), records, system
+
+
+def times(record, factor_q=1.0, factor_v=1.0, factor_u=1.0):
+    return replace(
+        record,
+        qpos=factor_q * record.qpos,
+        qvel=factor_v * record.qvel,
+        ctrl=factor_u * record.ctrl,
+    )
+
+
+DEGREES = 180 / np.pi
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [
+        (lambda r: times(r, factor_q=DEGREES), "velocity_scale"),
+        (lambda r: times(r, factor_v=DEGREES), "velocity_scale"),
+        (lambda r: times(r, factor_v=-1), "velocity_sign"),
+        (lambda r: times(r, factor_u=-1), "action_sign"),
+        (lambda r: replace(r, time=1e3 * r.time), "time_unit"),
+    ],
+)
+def test_units_and_signs(change, kind):
+    findings, records, system = spoilt(change)
+    assert kind in kinds(findings)
+    with pytest.raises(ValueError, match="logs that can be used"):
+        usable_logs(records, system, findings)
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [
+        (lambda r: times(r, factor_u=1e-3), "action_scale"),
+        (lambda r: times(r, factor_u=1e3), "action_range"),
+        (lambda r: times(r, factor_v=1.4), "velocity_scale"),
+        (lambda r: replace(r, qvel=np.roll(r.qvel, 4, axis=0)), "velocity_lag"),
+        (lambda r: replace(r, ctrl=np.ones_like(r.ctrl)), "constant_action"),
+        (lambda r: replace(r, qpos=np.round(r.qpos, 1)), "resolution"),
+    ],
+)
+def test_what_to_know(change, kind):
+    findings, *_ = spoilt(change)
+    assert kind in kinds(findings, "warning")
+
+
+def edited(record, rows, **columns):
+    """Set rows of the first coordinate."""
+    copies = {name: getattr(record, name).copy() for name in columns}
+    for name, value in columns.items():
+        part = copies[name][rows] if copies[name].ndim == 1 else copies[name][rows, 0]
+        new = value(part) if callable(value) else value
+        if copies[name].ndim == 1:
+            copies[name][rows] = new
+        else:
+            copies[name][rows, 0] = new
+    return replace(record, **copies)
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "rows"),
+    [
+        (lambda r: edited(r, slice(100, 101), qpos=lambda q: q + 0.5), "position_jump", (100, 100)),
+        (lambda r: edited(r, slice(50, 51), qvel=lambda v: v + 8.0), "velocity_spike", (50, 50)),
+        (lambda r: edited(r, slice(120, 180), qpos=lambda q: q[0]), "frozen", (125, 170)),
+        (lambda r: edited(r, slice(0, 300), qpos=0.3), "frozen", (0, 299)),
+        (lambda r: edited(r, slice(80, 81), time=lambda t: t - 0.305), "backward_time", (80, 80)),
+        (lambda r: edited(r, slice(80, 81), time=lambda t: t - 0.01), "repeated_time", (80, 80)),
+        (lambda r: edited(r, slice(80, 81), time=np.nan), "not_finite_time", (80, 80)),
+    ],
+)
+def test_rows_are_named_and_left_out(change, kind, rows):
+    findings, records, system = spoilt(change, only=2)
+    (found,) = [f for f in findings if f.kind == kind and f.severity == "error"]
+    assert found.file == "2.csv"
+    assert found.rows[0] <= rows[0]
+    assert found.rows[1] >= rows[1]
+    logs = usable_logs(records, system, findings)
+    left = sum(len(log) for log in logs if log.name.startswith("2.csv"))
+    assert left <= 300 - (rows[1] - rows[0] + 1)
+    assert sum(len(log) for log in logs) >= 5 * 300
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "rows"),
+    [
+        (lambda r: edited(r, slice(7, 9), ctrl=np.nan), "missing", (7, 8)),
+        (lambda r: replace(r, time=r.time + 0.2 * (r.time > 1)), "gap", (100, 101)),
+    ],
+)
+def test_rows_that_can_be_known_to_be_missing(change, kind, rows):
+    findings, *_ = spoilt(change, only=1)
+    (found,) = [f for f in findings if f.kind == kind]
+    assert (found.file, found.rows, found.severity) == ("1.csv", rows, "warning")
+
+
+def test_jumps_of_a_turn_are_undone():
+    system, records = simulated("arm")
+    wrapped = [replace(r, qpos=(r.qpos - 0.05) % (2 * np.pi) + 0.05) for r in records]
+    findings = check(wrapped, system)
+    assert not kinds(findings), findings[0]
+    assert "wrap" in kinds(findings, "warning")
+    for log, record in zip(usable_logs(wrapped, system, findings), records, strict=True):
+        shift = log.qpos.numpy() - record.qpos
+        np.testing.assert_allclose(shift, np.tile(shift[0], (300, 1)), atol=1e-9)
+
+
+def test_repeated_samples_and_jitter():
+    rng = np.random.default_rng(0)
+
+    def repeat(record):
+        rows = np.arange(300)
+        rows[1:] -= rng.random(299) < 0.1
+        return replace(record, qpos=record.qpos[rows], qvel=record.qvel[rows])
+
+    findings, *_ = spoilt(repeat)
+    assert "repeated_samples" in kinds(findings, "warning")
+    findings, *_ = spoilt(lambda r: replace(r, time=r.time + 0.004 * rng.random(300)))
+    assert "jitter" in kinds(findings, "warning")
+
+
+def test_a_push_is_found_and_friction_is_not_a_push():
+    task = SYSTEMS["arm"][0]()
+    task.model.dof_frictionloss[:] = 0.2
+    system, records = simulated("arm")
+    findings = check(records, system)
+    assert "push" not in kinds(findings)
+    with_friction = System(task=task)
+    assert "push" not in kinds(check(records, with_friction))
+    pushed = _pushed_arm(rows=range(150, 160), force=8.0)
+    found = [f for f in check([pushed, *records], system) if f.kind == "push"]
+    assert found
+    assert {f.file for f in found} == {"pushed.csv"}
+    assert all(140 <= f.rows[0] <= f.rows[1] <= 170 for f in found)
+
+
+def _pushed_arm(*, rows, force):
+    model = SYSTEMS["arm"][0]().model
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(3)
+    columns = {"time": [], "qpos": [], "qvel": [], "ctrl": []}
+    for t in range(300):
+        data.ctrl[:] = rng.uniform(-0.8, 0.8, 2) if t % 10 == 0 else data.ctrl
+        data.qfrc_applied[0] = force if t in rows else 0.0
+        for name, column in columns.items():
+            column.append(np.copy(getattr(data, name)))
+        mujoco.mj_step(model, data, 5)
+    arrays = {name: np.array(column) for name, column in columns.items()}
+    return Record(name="pushed.csv", **arrays)
+
+
+def servo(sign=1.0, scale=1.0):
+    """A joint that follows its commands, logged in another sign or unit."""
+    xml = ARM.replace('<motor name="m1"', '<position kp="40" kv="4" name="m1"')
+    task = arm(xml)
+    time = 0.01 * np.arange(400)
+    command = np.stack([0.5 * np.sin(2 * time), 0 * time], 1)
+    model, data = task.model, mujoco.MjData(task.model)
+    rows = []
+    for ctrl in command:
+        data.ctrl[:] = ctrl
+        rows.append((data.qpos.copy(), data.qvel.copy()))
+        mujoco.mj_step(model, data, 5)
+    qpos, qvel = (np.array(column) for column in zip(*rows, strict=True))
+    logged = command * np.array([sign * scale, 1.0])
+    return System(task=task), [Record(name="s.csv", time=time, qpos=qpos, qvel=qvel, ctrl=logged)]
+
+
+def test_servos_follow_their_commands():
+    assert not kinds(check(*reversed(servo())))
+    assert kinds(check(*reversed(servo(sign=-1)))) == {"action_sign"}
+    assert kinds(check(*reversed(servo(scale=DEGREES)))) == {"action_scale"}
+
+
+def test_copies_short_logs_and_single_trajectories():
+    system, records = simulated("arm", count=2)
+    findings = check([*records, replace(records[0], name="copy.csv")], system)
+    assert [(f.kind, f.file) for f in findings if f.severity == "error"] == [
+        ("copy", "copy.csv"),
+        ("short", "copy.csv"),
+    ]
+    findings = check(records[:1], system, horizon=300)
+    assert kinds(findings) == {"short"}
+    assert kinds(findings, "warning") == {"single_trajectory"}
+
+
+def test_degrees_beyond_a_range():
+    system, records = simulated("hopper")
+    turned = [times(r, factor_q=DEGREES, factor_v=DEGREES) for r in records]
+    assert "degrees" in kinds(check(turned, system))
+
+
+def test_a_finding_says_where():
+    finding = Finding(kind="gap", file="a.csv", rows=(3, 4), message="a gap of 1 s")
+    assert str(finding) == "warning: a.csv rows 3 to 4: a gap of 1 s (gap)"
+    assert finding.parts == ((3, 4),)
+
+
+def test_partly_measured_robots_are_checked_as_far_as_they_go():
+    system, records = simulated("arm")
+    columns = Columns("t", {"elbow": ("q",)}, {}, system.columns.ctrl)
+    system = System(task=system.task, columns=columns)
+    records = [
+        replace(r, qpos=r.qpos * [np.nan, 1], qvel=np.full_like(r.qvel, np.nan)) for r in records
+    ]
+    findings = check(records, system)
+    assert not kinds(findings)
+    (log, *_) = usable_logs(records, system, findings)
+    assert log.measured.tolist() == [False, True, False, False]
+    assert float(log.qpos[:, 0].abs().max()) == 0.0

@@ -1,0 +1,152 @@
+"""A sanity gate before any diagnosis: can these logs be believed?
+
+A finding of severity ``error`` says that a part of the logs contradicts itself or cannot be used,
+and `usable_logs` leaves that part out; a ``warning`` says what to know. What a simulator may get
+wrong (friction, gains, delays, noise) is no error here: that is what a diagnosis is for.
+"""
+
+from __future__ import annotations
+
+__all__ = ["check", "usable_logs"]
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ..errors import message
+from .columns import actuator_names
+from .finding import Finding
+from .forces import check_forces
+from .kinematics import check_channels, lattice_step, motions
+from .log import Log
+from .record import Record
+from .resampling import resample
+from .system import System
+from .timestamps import check_time
+
+
+def check(records: Sequence[Record], system: System, *, horizon: int = 10) -> list[Finding]:
+    """Return what is wrong or odd with logs, errors first.
+
+    Args:
+        records: Trajectories as they were logged.
+        system: The robot.
+        horizon: Control steps that a log must have at least.
+
+    Example:
+        >>> from torchrl_bayessim.envs.tasks.catalogue import known_task
+        >>> system = System(task=known_task("InvertedPendulum-v5"))
+        >>> time = 0.04 * np.arange(50)
+        >>> turning = np.stack([0 * time, np.rad2deg(time)], 1)
+        >>> record = Record(name="log.csv", time=time, qpos=turning, qvel=np.ones((50, 2)),
+        ...                 ctrl=np.ones((50, 1)))
+        >>> finding = check([record], system)[0]
+        >>> finding.kind, finding.severity, finding.rows
+        ('degrees', 'error', (0, 49))
+    """
+    found: list[Finding] = []
+    for record in records:
+        found += check_time(record, system.control_dt)
+        found += check_channels(record, system)
+        found += _missing(record)
+    found += _copies(records)
+    found += _resolution(records, system)
+    found += _actions(records, system)
+    logs = [_logs(record, system, found) for record in records]
+    found += check_forces(records, logs, system)
+    for record, parts in zip(records, logs, strict=True):
+        longest = max((len(log) for log in parts), default=0)
+        if longest <= horizon:
+            text = f"{longest} control steps in succession can be used, {horizon + 1} are needed"
+            found.append(_whole("short", record, text, severity="error"))
+    if len(records) == 1:
+        text = "a single trajectory: nothing can be tested on another one"
+        found.append(_general("single_trajectory", text))
+    return sorted(found, key=lambda finding: finding.severity != "error")
+
+
+def usable_logs(
+    records: Sequence[Record], system: System, findings: Sequence[Finding]
+) -> list[Log]:
+    """Return logs at the control step, without the parts that findings call an error.
+
+    Raises:
+        ValueError: Nothing is left.
+    """
+    general = [f for f in findings if f.severity == "error" and not f.file]
+    logs = [] if general else [log for r in records for log in _logs(r, system, findings)]
+    if not logs:
+        errors = [str(f) for f in findings if f.severity == "error"]
+        raise ValueError(message("logs that can be used", "; ".join(errors) or "none"))
+    return logs
+
+
+def _logs(record: Record, system: System, findings: Sequence[Finding]) -> list[Log]:
+    errors = [f for f in findings if f.severity == "error" and f.file == record.name]
+    try:
+        return resample(record, system, leave_out=[part for f in errors for part in f.parts])
+    except ValueError:  # nothing is left, and the findings say why
+        return []
+
+
+def _whole(kind: str, record: Record, text: str, *, severity: str = "warning") -> Finding:
+    rows = 0, len(record) - 1
+    return Finding(kind=kind, file=record.name, rows=rows, message=text, severity=severity)
+
+
+def _general(kind: str, text: str) -> Finding:
+    return Finding(kind=kind, file="", rows=(0, 0), message=text)
+
+
+def _missing(record: Record) -> Iterator[Finding]:
+    """Find values that are missing in some rows, or in all where they are needed."""
+    bad = np.zeros(len(record), dtype=bool)
+    for values in (record.qpos, record.qvel):
+        finite = np.isfinite(values)
+        bad |= ~finite[:, finite.any(0)].all(1)
+    bad |= ~np.isfinite(record.ctrl).all(1)
+    if bad.any():
+        rows = np.flatnonzero(bad)
+        text = f"{len(rows)} row(s) with values that are missing, left out"
+        place = int(rows[0]), int(rows[-1])
+        yield Finding(kind="missing", file=record.name, rows=place, message=text)
+
+
+def _copies(records: Sequence[Record]) -> Iterator[Finding]:
+    for i, later in enumerate(records):
+        for earlier in records[:i]:
+            if len(earlier) == len(later) and all(
+                np.array_equal(getattr(earlier, name), getattr(later, name), equal_nan=True)
+                for name in ("qpos", "qvel", "ctrl")
+            ):
+                yield _whole("copy", later, f"a copy of {earlier.name}", severity="error")
+                break
+
+
+def _resolution(records: Sequence[Record], system: System) -> Iterator[Finding]:
+    """Find channels whose values are multiples of a step that is not small."""
+    steps: dict[str, list[tuple[float, float]]] = {}
+    for record in records:
+        for motion in motions(record, system):
+            for name, values in ("", motion.position), (" velocity", motion.velocity):
+                if values is not None and np.isfinite(values).all():
+                    pair = lattice_step(values), float(np.ptp(values))
+                    steps.setdefault(f"{motion.name}{name}", []).append(pair)
+    for name, pairs in steps.items():
+        step, span = np.median(pairs, axis=0)
+        if step > 1e-3 * span > 0:
+            text = f"{name} has a resolution of {step:.3g}, {step / span:.1%} of its span"
+            yield _general("resolution", text)
+
+
+def _actions(records: Sequence[Record], system: System) -> Iterator[Finding]:
+    model = system.task.model
+    for i, name in enumerate(actuator_names(model)):
+        ranges = [np.ptp(record.ctrl[:, i]) for record in records]
+        if not np.nanmax(ranges) > 0:
+            yield _general("constant_action", f"the action {name} never changes")
+        low, high = model.actuator_ctrlrange[i]
+        largest = np.nanmax([np.nanmax(np.abs(record.ctrl[:, i])) for record in records])
+        if model.actuator_ctrllimited[i] and largest > 1.5 * max(-low, high):
+            text = f"the action {name} reaches {largest:.3g}, and the model clips it to {high:.3g}"
+            yield _general("action_range", text)
