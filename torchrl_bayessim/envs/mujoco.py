@@ -19,6 +19,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ..errors import message
+from .additions import Addition, rollout_with
 from .draws import Draws
 from .model_batch import ModelBatch
 from .stepper import Stepper
@@ -84,6 +85,7 @@ class BatchedMujocoEnv(EnvBase):
             drive=self.task.drive,
             threads=threads,
         )
+        self._additions: dict[object, Addition] = {}
         self._seed = seed
         self._episodes = np.zeros(num_envs, dtype=np.int64)
         self._elapsed = torch.zeros(num_envs, 1, dtype=torch.int64)
@@ -134,6 +136,18 @@ class BatchedMujocoEnv(EnvBase):
         self._start(rows, {name: np.asarray(value)[rows] for name, value in components.items()})
         return self._started()
 
+    def add(self, key: object, addition: Addition) -> None:
+        """Call ``addition`` before every time step from now on, in place of the one of that key.
+
+        Raises:
+            ValueError: The task's commands are not its controls.
+        """
+        drive = self.task.drive
+        if drive.relative or drive.weld is not None or drive.pinned:
+            expected = "a task whose commands are its controls, to add to them every time step"
+            raise ValueError(message(expected, drive))
+        self._additions[key] = addition
+
     def open_loop(self, actions: Tensor) -> TensorDictBase:
         """Apply whole sequences of actions in one native call; nothing is reset on the way.
 
@@ -151,7 +165,7 @@ class BatchedMujocoEnv(EnvBase):
         if actions.ndim != 3 or (actions.shape[0], actions.shape[2]) != (self.num_envs, size):
             expected = f"actions of shape ({self.num_envs}, T, {size})"
             raise ValueError(message(expected, tuple(actions.shape)))
-        outputs = self.stepper.rollout(self._commands(actions), substeps=self.task.frame_skip)
+        outputs = self._advance(self._commands(actions))
         before = self._read(np.concatenate([self._outputs[0], outputs[:, :-1]], axis=1))
         after = self._read(outputs)
         diverged = torch.from_numpy(np.isnan(outputs[..., :1]))
@@ -178,7 +192,7 @@ class BatchedMujocoEnv(EnvBase):
         commands = self._commands(action.unsqueeze(1))
         self._outputs.reverse()
         self._readings.reverse()
-        self.stepper.rollout(commands, substeps=self.task.frame_skip, outputs=self._outputs[0])
+        self._advance(commands, self._outputs[0])
         after, before = self._readings
         diverged = torch.from_numpy(self.stepper.status != 0).unsqueeze(-1)
         if diverged.any():
@@ -187,6 +201,17 @@ class BatchedMujocoEnv(EnvBase):
         self._elapsed += 1
         reward = self.task.reward(before, after, action.double())
         return self._result(after, reward, self._elapsed, diverged)
+
+    def _advance(
+        self, commands: NDArray[np.float64], outputs: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        substeps = self.task.frame_skip
+        if not self._additions:
+            return self.stepper.rollout(commands, substeps=substeps, outputs=outputs)
+        added = rollout_with(self.stepper, self._additions.values(), commands, substeps=substeps)
+        if outputs is not None:
+            outputs[:] = added
+        return added
 
     def _start(
         self, rows: NDArray[np.int64], given: Mapping[str, NDArray[np.float64]] | None = None

@@ -1,0 +1,102 @@
+"""Forces that a simulator lacks, added before every time step instead of every control step.
+
+An *addition* is a function of the states before a time step, tensors ``(*batch, size)``: ``qpos``,
+``qvel``, ``time`` and ``ctrl``. It returns what is added in that time step alone to ``ctrl`` (seen
+by the additions that follow), to ``qfrc_applied``, or to the model's ``dof_frictionloss`` and
+``dof_damping``; whatever else has set these stays in force underneath.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Addition", "rollout_with", "steps_with"]
+
+from collections.abc import Callable, Iterable, Mapping
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .stepper import Stepper
+
+Addition = Callable[[SimpleNamespace], Mapping[str, Tensor]]
+_FIELDS = "dof_frictionloss", "dof_damping"
+_Array = NDArray[np.float64]
+
+
+def rollout_with(
+    stepper: Stepper, additions: Iterable[Addition], commands: _Array, *, substeps: int
+) -> _Array:
+    """Apply sequences of commands, as `Stepper.rollout` does, with additions at every time step.
+
+    Args:
+        stepper: The simulations; those that diverge stay in the state before that time step.
+        additions: In their order.
+        commands: Shape ``(N, T, nu)``.
+        substeps: Time steps per command.
+
+    Returns:
+        The outputs after each command, shape ``(N, T, M)``; NaN after a divergence.
+    """
+    models, count = stepper.models, stepper.models.model.nv
+    base = {f: [models.read(f, (d,)) for d in range(count)] for f in _FIELDS}
+    applied = stepper["qfrc_applied"].copy()
+    rows = np.arange(stepper.num_envs)
+    outputs = np.full((*commands.shape[:2], stepper.output_size), np.nan)
+    after = np.empty((stepper.num_envs, 1, stepper.output_size))
+    for t in range(commands.shape[1]):
+        for _ in range(substeps):
+            names = "qpos", "qvel", "time"
+            state = {name: torch.from_numpy(stepper[name]) for name in names}
+            added = _total(additions, ctrl=torch.from_numpy(commands[:, t]), **state)
+            stepper["qfrc_applied"][:] = applied + added.get("qfrc_applied", 0.0)
+            for field in _FIELDS:
+                for d, value in enumerate(base[field] if field in added else ()):
+                    models.write(field, (d,), value + added[field][:, d])
+            command = commands[:, t] + added.get("ctrl", 0.0)
+            stepper.rollout(command[:, None], substeps=1, rows=rows, outputs=after)
+            rows = rows[stepper.status[rows] == 0]
+        outputs[rows, t] = after[rows, 0]
+    stepper["qfrc_applied"][:] = applied
+    for field, values in base.items():
+        for d, value in enumerate(values):
+            if not np.array_equal(models.read(field, (d,)), value):
+                models.write(field, (d,), value)
+    return outputs
+
+
+def steps_with(
+    model: mujoco.MjModel, data: mujoco.MjData, additions: Iterable[Addition], *, count: int
+) -> None:
+    """Step one simulation ``count`` times under its present controls, with additions each time."""
+    control, applied = data.ctrl.copy(), data.qfrc_applied.copy()
+    base = {field: getattr(model, field).copy() for field in _FIELDS}
+    try:
+        for _ in range(count):
+            state = {n: torch.from_numpy(getattr(data, n).copy()) for n in ("qpos", "qvel")}
+            time = torch.tensor([data.time], dtype=torch.float64)
+            added = _total(additions, ctrl=torch.from_numpy(control), time=time, **state)
+            data.ctrl[:] = control + added.get("ctrl", 0.0)
+            data.qfrc_applied[:] = applied + added.get("qfrc_applied", 0.0)
+            for field in _FIELDS:
+                getattr(model, field)[:] = base[field] + added.get(field, 0.0)
+            mujoco.mj_step(model, data)
+    finally:
+        data.ctrl[:] = control
+        data.qfrc_applied[:] = applied
+        for field in _FIELDS:
+            getattr(model, field)[:] = base[field]
+
+
+def _total(additions: Iterable[Addition], **state: Tensor) -> dict[str, _Array]:
+    """Return the sum of what all additions add."""
+    now = SimpleNamespace(**state)
+    total: dict[str, _Array] = {}
+    for addition in additions:
+        for name, value in addition(now).items():
+            total[name] = total.get(name, 0.0) + value.numpy()
+            if name == "ctrl":
+                now.ctrl = now.ctrl + value
+    return total
