@@ -1,0 +1,281 @@
+"""An effect of the catalogue on any environment, as a transform."""
+
+from __future__ import annotations
+
+__all__ = ["ApplyEffect"]
+
+from types import SimpleNamespace
+from typing import Any, Self
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform
+
+from ..effects.catalogue import effect as known_effect
+from ..effects.effect import ActionEffect, Effect, ForceEffect, Memory, ModelEffect, SensorEffect
+from ..effects.forcing import Forcing
+from ..effects.memory import renewed
+from ..effects.overlay import Overlay
+from ..effects.robot import Robot
+from ..effects.strength import Strength, strength_of
+from ..envs.task import Readings
+from ..errors import message
+from ..physics.mujoco_models import models_of
+from ..randomness import generator
+from .resets import resets, simulator
+from .simulators import add_every_time_step, robot_of_env
+
+
+class ApplyEffect(Transform):
+    """Lets an effect act: on actions, on what is observed, on forces or on the model.
+
+    Effects on actions and observations act around any environment, those on forces at every time
+    step and those on the model at resets of a MuJoCo environment. Hidden state starts anew where
+    an environment resets. Beside an `ApplyPhysics`, put it after that: at a reset the parameters
+    are written first, and the effect changes what is then in force, never its own last change.
+
+    Args:
+        effect: The effect, or its name in the catalogue.
+        strength: One number for all targets, one for each, shape ``(N,)`` or ``(*batch, N)``, or
+            by target. It may be set anew at any time; model effects heed it from the next reset
+            of an environment on, the others at once. Clones share it.
+        robot: What it acts on; default what the environment says of itself.
+        key: The entry that holds the action or observation; default the environment's action,
+            and ``observation``.
+        channels: Names of the elements of the observation; default their numbers.
+        seed: Of random effects.
+
+    Raises:
+        KeyError: The catalogue has no such effect, or the effect no such target.
+        PhysicsError: The environment is not one of MuJoCo's, for effects on forces or the model.
+        TypeError: It is put around a ``SerialEnv`` or ``ParallelEnv``, for the same; or without
+            ``robot``.
+        ValueError: The robot has no target for it, or the strengths do not fit the targets.
+
+    Example:
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> friction = ApplyEffect("coulomb_friction", {"hinge": 0.1})
+        >>> env = TransformedEnv(GymEnv("InvertedPendulum-v5"), friction)
+        >>> env.rollout(3)["next", "observation"].shape
+        torch.Size([3, 4])
+        >>> friction.strength = {"hinge": 0.2}
+    """
+
+    def __init__(
+        self,
+        effect: Effect | str,
+        strength: Strength,
+        *,
+        robot: Robot | None = None,
+        key: NestedKey | None = None,
+        channels: tuple[str, ...] = (),
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.effect = known_effect(effect) if isinstance(effect, str) else effect
+        self.key, self.channels = key, channels
+        self._shared: dict[str, Any] = {"robot": robot, "strength": strength, "identity": object()}
+        self._random = generator(seed, self.effect.name)
+        self._memory: Memory | None = None
+        self._steps = torch.zeros(0)  # since the episode began, shape (*batch, 1)
+        self._overlay: Overlay | None = None
+        if robot is not None:
+            self.strength = strength
+
+    @property
+    def robot(self) -> Robot:
+        """What it acts on.
+
+        Raises:
+            ValueError: Nothing is known of it before it is put on an environment.
+        """
+        robot = self._shared["robot"]
+        if robot is None:
+            expected = f"an environment or a robot for {self.effect.name}"
+            raise ValueError(message(expected, "none", hint="robot=robot_of(task)"))
+        return robot
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The names of what it acts on, in the order of strengths."""
+        return self.effect.targets(self.robot)
+
+    @property
+    def strength(self) -> Tensor:
+        """Strengths, shape ``(N,)`` or ``(*batch, N)``."""
+        return self._shared["strength"]
+
+    @strength.setter
+    def strength(self, strength: Strength) -> None:
+        self._shared["strength"] = strength
+        if self._shared["robot"] is None:  # checked when it is put on an environment
+            return
+        values = strength_of(self.effect.name, strength, self.targets)
+        if self.parent is not None:
+            batch = self.parent.batch_size
+            try:
+                values.expand(*batch, len(self.targets))
+            except RuntimeError:
+                expected = f"strengths of {self.effect.name} of shape {(*batch, len(self.targets))}"
+                raise ValueError(message(expected, tuple(values.shape))) from None
+        self._shared["strength"] = values
+
+    def clone(self) -> Self:
+        """Return a copy with a hidden state of its own, and the same strength."""
+        copy = super().clone()
+        copy._shared, copy._memory = self._shared, None
+        return copy
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Attach to the environment."""
+        super().set_container(container)
+        if self.parent is None:  # in a Compose that has no environment yet
+            return
+        env = simulator(self.parent)
+        onto_simulator = isinstance(self.effect, ForceEffect | ModelEffect)
+        if onto_simulator and isinstance(env, SerialEnv | ParallelEnv):
+            name = self.effect.name
+            hint = "put it inside the function that makes each environment"
+            got = f"{name} around a {type(env).__name__}"
+            raise TypeError(message(f"{name} beside each simulator", got, hint=hint))
+        if self._shared["robot"] is None:
+            self._shared["robot"] = self._robot(env)
+        self.strength = self._shared["strength"]
+        self._steps = torch.zeros(*env.batch_size, 1, dtype=torch.float64)
+        if self.key is None:
+            acts = isinstance(self.effect, ActionEffect)
+            self.key = self.parent.action_key if acts else "observation"
+        if isinstance(self.effect, ForceEffect):
+            self._forcing = Forcing(self.robot)
+            add_every_time_step(env, self._shared["identity"], self._push)
+        elif isinstance(self.effect, ModelEffect):
+            overlays = env.__dict__.setdefault("_overlays", {})  # clones share it
+            models = models_of(env)
+            self._overlay = overlays.setdefault(self._shared["identity"], Overlay(models))
+
+    def _robot(self, env: EnvBase) -> Robot:
+        if isinstance(env, SerialEnv | ParallelEnv):
+            expected = f"robot= for {self.effect.name} around several simulators"
+            raise TypeError(message(expected, "none"))
+        if not isinstance(self.effect, SensorEffect):
+            if isinstance(self.effect, ForceEffect | ModelEffect):
+                models_of(env)  # or an error
+            return robot_of_env(env)
+        assert self.parent is not None
+        size = self.parent.full_observation_spec[self.key or "observation"].shape[-1]
+        names = self.channels or tuple(f"{self.key or 'observation'}{i}" for i in range(size))
+        return Robot(
+            dt=robot_of_env(env).dt,
+            channels=names,
+            channel_scale=torch.ones(len(names), dtype=torch.float64),
+            channel_joint=(-1,) * len(names),
+            channel_kind=("other",) * len(names),
+        )
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Lift the bounds of what a sensor effect changes."""
+        if isinstance(self.effect, SensorEffect):
+            assert isinstance(observation_spec, Composite)  # what TorchRL hands to transforms
+            key = self.key or "observation"
+            spec = observation_spec[key]
+            observation_spec[key] = Unbounded(spec.shape, dtype=spec.dtype, device=spec.device)
+        return observation_spec
+
+    # What happens at a step.
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if not isinstance(self.effect, ActionEffect):
+            return tensordict
+        assert self.key is not None  # set when it was put on an environment
+        action = tensordict.get(self.key)
+        if self._memory is None:
+            self._memory = self.effect.start(action)
+        now, strength = self._now(action)
+        changed, self._memory = self.effect.command(action, strength, self._memory, now)
+        self._steps = self._steps + 1
+        return tensordict.set(self.key, changed)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        del tensordict
+        if isinstance(self.effect, SensorEffect):
+            self._steps = self._steps + 1
+            self._show(next_tensordict, None)
+        return next_tensordict
+
+    def _push(self, state: Readings) -> dict[str, Tensor]:
+        """Return what a force effect adds in the coming time step."""
+        assert isinstance(self.effect, ForceEffect)
+        active = [(self.effect, self.strength)]
+        if self._memory is None:
+            (self._memory,) = self._forcing.start(active, state)
+        added, (self._memory,) = self._forcing(active, [self._memory], state)
+        return added
+
+    def _show(self, tensordict: TensorDictBase, mask: Tensor | None) -> None:
+        """Replace the observation by what is measured of it, in ``mask`` or everywhere."""
+        assert isinstance(self.effect, SensorEffect)
+        assert self.key is not None  # set when it was put on an environment
+        reading = tensordict.get(self.key)
+        if self._memory is None:
+            self._memory = self.effect.start(reading)
+        elif mask is not None:
+            self._memory = renewed(self._memory, self.effect.start(reading), mask)
+        now, strength = self._now(reading)
+        shown, memory = self.effect.measure(reading, strength, self._memory, now)
+        # what environments that go on have seen is theirs, and their memory too
+        self._memory = memory if mask is None else renewed(self._memory, memory, mask)
+        tensordict.set(self.key, shown)
+
+    def _now(self, value: Tensor) -> tuple[SimpleNamespace, Tensor]:
+        """Return what the law may look at, and the strengths, of the kind of ``value``."""
+        noise = None
+        if self.effect.random:
+            noise = torch.rand(value.shape, generator=self._random, dtype=torch.float64)
+            noise = noise.to(value)
+        time = self._steps * self.robot.dt
+        return SimpleNamespace(robot=self.robot, time=time, noise=noise), self.strength.to(value)
+
+    # What happens at a reset.
+
+    def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
+        if self._overlay is not None:
+            self._overlay.remove(self._rows(tensordict))
+        return tensordict
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        mask = resets(self.parent, tensordict)
+        self._steps = torch.where(mask.unsqueeze(-1), 0.0, self._steps)
+        if isinstance(self.effect, SensorEffect):
+            self._show(tensordict_reset, mask)
+        elif isinstance(self.effect, ModelEffect):
+            assert self._overlay is not None
+            rows = self._rows(tensordict)
+            strength = self.strength.expand(len(rows), -1)
+            self._overlay.put(self.effect, strength, self.robot, rows)
+        elif self._memory is not None:
+            self._memory = renewed(self._memory, self._beginning(), mask)
+        return tensordict_reset
+
+    def _rows(self, tensordict: TensorDictBase | None) -> Any:
+        """Return which models a reset concerns, shape ``(P,)``."""
+        assert self.parent is not None
+        if tensordict is None:
+            return torch.ones(self.parent.batch_size, dtype=torch.bool).reshape(-1).numpy()
+        return resets(self.parent, tensordict).reshape(-1).numpy()
+
+    def _beginning(self) -> Memory:
+        assert self.parent is not None
+        batch = self.parent.batch_size
+        if isinstance(self.effect, ActionEffect):
+            spec = self.parent.full_action_spec[self.key]
+            return self.effect.start(torch.zeros(spec.shape, dtype=spec.dtype))
+        assert isinstance(self.effect, ForceEffect)
+        joints = len(self.robot.joints)
+        return self.effect.start(torch.zeros(*batch, joints, dtype=torch.float64))
+
+    def __repr__(self) -> str:
+        return f"ApplyEffect({self.effect.name}, strength={self.strength})"
