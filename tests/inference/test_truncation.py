@@ -9,11 +9,10 @@ from scipy.integrate import quad
 from torch.distributions import MultivariateNormal
 
 from torchrl_bayessim.inference import truncation
+from torchrl_bayessim.inference.truncated_normal import log_interval, truncated_quantile
 from torchrl_bayessim.inference.truncation import (
     TruncatedGaussianMixture,
-    log_interval,
     log_mass,
-    truncated_quantile,
 )
 from torchrl_bayessim.randomness import generator
 
