@@ -19,8 +19,9 @@ leaves out: friction, a delay, a gap.
 and in the state specs, so that a critic may read it and a reset may bring it.
 """
 
-__all__ = ["ApplyEffect", "ApplyPhysics", "DomainRandomizer"]
+__all__ = ["ApplyEffect", "ApplyPhysics", "DomainRandomizer", "EffectPhysics"]
 
 from .apply_effect import ApplyEffect
 from .apply_physics import ApplyPhysics
 from .domain_randomizer import DomainRandomizer
+from .effect_physics import EffectPhysics

@@ -140,8 +140,7 @@ class ApplyEffect(Transform):
             hint = "put it inside the function that makes each environment"
             got = f"{name} around a {type(env).__name__}"
             raise TypeError(message(f"{name} beside each simulator", got, hint=hint))
-        if self._shared["robot"] is None:
-            self._shared["robot"] = self._robot(env)
+        self.know(env, self.parent)
         self.strength = self._shared["strength"]
         self._steps = torch.zeros(*env.batch_size, 1, dtype=torch.float64)
         if self.key is None:
@@ -155,24 +154,38 @@ class ApplyEffect(Transform):
             models = models_of(env)
             self._overlay = overlays.setdefault(self._shared["identity"], Overlay(models))
 
-    def _robot(self, env: EnvBase) -> Robot:
+    def know(self, env: EnvBase, outside: EnvBase | None = None) -> None:
+        """Learn from a simulator what there is to act on, where no robot was given.
+
+        Args:
+            env: The simulator.
+            outside: The environment with the transforms before this one; default none.
+
+        Raises:
+            TypeError: It is several simulators.
+            PhysicsError: It is not one of MuJoCo's, for effects on forces or the model.
+            ValueError: It does not say how long a control step is.
+        """
+        if self._shared["robot"] is not None:
+            return
         if isinstance(env, SerialEnv | ParallelEnv):
             expected = f"robot= for {self.effect.name} around several simulators"
             raise TypeError(message(expected, "none"))
-        if not isinstance(self.effect, SensorEffect):
-            if isinstance(self.effect, ForceEffect | ModelEffect):
-                models_of(env)  # or an error
-            return robot_of_env(env)
-        assert self.parent is not None
-        size = self.parent.full_observation_spec[self.key or "observation"].shape[-1]
-        names = self.channels or tuple(f"{self.key or 'observation'}{i}" for i in range(size))
-        return Robot(
-            dt=robot_of_env(env).dt,
-            channels=names,
-            channel_scale=torch.ones(len(names), dtype=torch.float64),
-            channel_joint=(-1,) * len(names),
-            channel_kind=("other",) * len(names),
-        )
+        if isinstance(self.effect, ForceEffect | ModelEffect):
+            models_of(env)  # or an error
+        robot = robot_of_env(env)
+        if isinstance(self.effect, SensorEffect):
+            key = self.key or "observation"
+            size = (env if outside is None else outside).full_observation_spec[key].shape[-1]
+            names = self.channels or tuple(f"{key}{i}" for i in range(size))
+            robot = Robot(
+                dt=robot.dt,
+                channels=names,
+                channel_scale=torch.ones(len(names), dtype=torch.float64),
+                channel_joint=(-1,) * len(names),
+                channel_kind=("other",) * len(names),
+            )
+        self._shared["robot"] = robot
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Lift the bounds of what a sensor effect changes."""

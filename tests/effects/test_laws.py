@@ -1,0 +1,393 @@
+"""Known answers of the laws, one by one."""
+
+import math
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from apparatus import arm, arm_task
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchrl_bayessim.effects.catalogue import CATALOGUE, effect
+from torchrl_bayessim.effects.effect import ActionEffect, SensorEffect
+from torchrl_bayessim.effects.fields import ModelFields
+from torchrl_bayessim.effects.forcing import Forcing
+from torchrl_bayessim.effects.history import advanced, delayed, empty_line, read_line
+from torchrl_bayessim.effects.overlay import Overlay
+from torchrl_bayessim.effects.robot import Robot, robot_of
+from torchrl_bayessim.effects.sequence import (
+    command_sequence,
+    measured_sequence,
+    restored_sequence,
+)
+from torchrl_bayessim.effects.strength import strength_of
+from torchrl_bayessim.envs.model_batch import ModelBatch
+from torchrl_bayessim.envs.task import Readings, Task
+
+ROBOT = Robot(
+    dt=0.1,
+    actuators=("motor",),
+    command_scale=torch.tensor([2.0]).double(),
+    joint_of_actuator=(-1,),
+    channels=("q",),
+    channel_scale=torch.tensor([1.0]).double(),
+    channel_joint=(-1,),
+    channel_kind=("other",),
+)
+
+
+def column(*values):
+    return torch.tensor(values, dtype=torch.float64)[:, None]
+
+
+def changed(name, strength, *values, **options):
+    law = effect(name, **options)
+    apply = command_sequence if isinstance(law, ActionEffect) else measured_sequence
+    return apply(law, column(*values), torch.tensor([strength]).double(), ROBOT)[:, 0].tolist()
+
+
+@pytest.mark.parametrize(
+    ("name", "strength", "given", "expected"),
+    [
+        ("action_delay", 0.15, (0, 1, 2, 4), (0, 0, 0.5, 1.5)),
+        ("action_lag", 0.1 / math.log(2), (0, 1, 1, 1), (0, 0.5, 0.75, 0.875)),
+        ("dead_band", 0.3, (-1, -0.2, 0, 0.3, 1), (-0.7, 0, 0, 0, 0.7)),
+        ("saturation", 0.25, (-2, -1, 1.6), (-1.5, -1, 1.5)),
+        ("action_gain", -0.5, (1, -2), (0.5, -1)),
+        ("action_bias", 0.1, (1, -2), (1.1, -1.9)),
+        ("battery_sag", 0.5, (2, 2, 2), (2, 1.99, 1.98)),
+        ("action_quantization", 0.5, (0.2, 0.3, -1.1), (0, 0.5, -1)),
+        ("sensor_delay", 0.2, (5, 1, 2, 4), (5, 5, 5, 1)),
+        ("sensor_bias", -0.5, (1, 2), (0.5, 1.5)),
+        ("sensor_gain", 0.1, (1, 2), (1.1, 2.2)),
+        ("sensor_quantization", 0.1, (0.26, 0.11), (0.3, 0.1)),
+        ("sensor_lag", 0.1 / math.log(2), (0, 1, 1), (0, 0.5, 0.75)),
+        ("sensor_drift", 2.0, (1, 1, 1), (1, 1.2, 1.4)),
+    ],
+)
+def test_formulas(name, strength, given, expected):
+    assert changed(name, strength, *given) == pytest.approx(expected)
+
+
+def test_a_battery_loses_no_more_than_half_again_of_its_sag():
+    values = changed("battery_sag", 0.4, *[1.0] * 40, seconds=1.0)
+    assert values[10] == pytest.approx(0.6)
+    assert values[20] == values[-1] == pytest.approx(0.4)
+
+
+def test_lost_packets_and_samples_repeat_the_last_that_arrived():
+    noise = column(0.9, 0.1, 0.9, 0.1, 0.1)
+    for name, apply in (("packet_drop", command_sequence), ("sensor_dropout", measured_sequence)):
+        strength = torch.tensor([0.3]).double()
+        result = apply(effect(name), column(1, 2, 3, 4, 5), strength, ROBOT, noise=noise)
+        assert result[:, 0].tolist() == [1, 1, 3, 3, 3]
+
+
+def test_noise_has_the_standard_deviation_that_it_says():
+    record = torch.zeros(20_000, 1, dtype=torch.float64)
+    noisy = measured_sequence(
+        effect("sensor_noise"), record, torch.tensor([0.2]).double(), ROBOT, seed=1
+    )
+    assert noisy.std().item() == pytest.approx(0.2, rel=0.03)
+    assert noisy.mean().item() == pytest.approx(0.0, abs=0.01)
+
+
+def test_jitter_stays_within_its_strength():
+    record = torch.arange(200, dtype=torch.float64)[:, None]
+    late = record - command_sequence(
+        effect("action_jitter"), record, torch.tensor([0.2]).double(), ROBOT
+    )
+    assert late.min() >= 0
+    assert 1.8 < late.max() <= 2.0
+    assert late.mean().item() == pytest.approx(1.0, abs=0.1)
+
+
+@given(
+    steps=st.floats(0, 8),
+    seed=st.integers(0, 99),
+)
+def test_a_delay_step_by_step_is_the_delay_of_the_whole(steps, seed):
+    record = torch.randn(12, 2, generator=torch.Generator().manual_seed(seed)).double()
+    line, late = empty_line(record[0], 8), []
+    for value in record:
+        shown, line = read_line(line, value, torch.tensor(steps).double())
+        late.append(shown)
+    torch.testing.assert_close(torch.stack(late), delayed(record, torch.tensor([[steps]]).double()))
+
+
+@given(whole=st.integers(0, 5))
+def test_advancing_undoes_a_delay_of_whole_steps_but_for_the_end(whole):
+    record = torch.arange(12, dtype=torch.float64)[:, None]
+    steps = torch.tensor([[float(whole)]])
+    back = advanced(delayed(record, steps), steps)
+    assert torch.equal(back[: 12 - whole], record[: 12 - whole])
+
+
+@pytest.mark.parametrize(
+    ("name", "tolerance"),
+    [("sensor_bias", 1e-12), ("sensor_gain", 1e-12), ("sensor_lag", 1e-9),
+     ("sensor_drift", 1e-12), ("sensor_delay", 0.02)],
+)  # fmt: skip
+def test_restoring_undoes_a_measurement(name, tolerance):
+    t = torch.arange(60, dtype=torch.float64)[:, None] * 0.1
+    true = torch.sin(t).expand(3, -1, -1)
+    strength = torch.tensor([0.0, 0.02, 0.1]).double()[:, None]
+    law = effect(name)
+    back = restored_sequence(law, measured_sequence(law, true, strength, ROBOT), strength, ROBOT)
+    torch.testing.assert_close(back[:, :-2], true[:, :-2], rtol=0, atol=tolerance)
+    assert torch.equal(back[0], true[0])
+
+
+def test_only_laws_with_an_inverse_restore_anything():
+    record = torch.randn(5, 1, generator=torch.Generator().manual_seed(0)).double()
+    for name, kind in CATALOGUE.items():
+        if issubclass(kind, SensorEffect) and kind.random:
+            back = restored_sequence(kind(), record, torch.tensor([0.1]), ROBOT)
+            assert torch.equal(back, record), name
+
+
+# Forces.
+
+
+def forces(name, strength, *, qvel=0.0, qpos=0.0, ctrl=(0.0, 0.0, 0.0), time=0.0, **options):
+    robot = arm()
+    state = Readings(
+        qpos=torch.full((4,), qpos).double(),
+        qvel=torch.full((4,), qvel).double(),
+        ctrl=torch.tensor(ctrl).double(),
+        time=torch.tensor([time]).double(),
+    )
+    law = effect(name, **options)
+    active = [(law, torch.full((len(law.targets(robot)),), strength).double())]
+    forcing = Forcing(robot)
+    (added, _) = forcing(active, forcing.start(active, state), state)
+    return {key: value.tolist() for key, value in added.items()}
+
+
+def test_friction_laws():
+    at = pytest.approx
+    assert forces("stribeck_friction", 2.0, qvel=0.2)["dof_frictionloss"] == at([2 / math.e] * 4)
+    assert forces("quadratic_drag", 2.0, qvel=-3.0)["dof_damping"] == at([6.0] * 4)
+    assert forces("directional_friction", 2.0, qvel=1.0)["dof_frictionloss"] == [2.0] * 4
+    assert forces("directional_friction", 2.0, qvel=-1.0)["dof_frictionloss"] == [0.0] * 4
+    assert forces("directional_friction", -2.0, qvel=-1.0)["dof_frictionloss"] == [2.0] * 4
+    # gear 2 at the shoulder, a servo of gain 5 that is 1 rad off, gear −1 at the rail
+    loads = forces("load_dependent_friction", 0.5, ctrl=(1.5, 1.0, 4.0))["dof_frictionloss"]
+    assert loads == at([1.5, 2.5, 2.0, 0.0])
+
+
+def test_disturbances():
+    assert forces("constant_force", 2.0)["qfrc_applied"] == [2.0] * 4
+    wave = forces("periodic_disturbance", 2.0, frequency=0.5, phase=0.1, time=0.3)
+    assert wave["qfrc_applied"] == pytest.approx([2 * math.sin(math.pi * 0.3 + 0.1)] * 4)
+    ripple = forces("cogging", 2.0, number=4, qpos=0.2)
+    assert ripple["qfrc_applied"] == pytest.approx([2 * math.sin(0.8)] * 4)
+    robot = arm()
+    assert effect("cogging").bounds(robot)[1][2:].tolist() == [0.0, 0.0]  # slides
+
+
+def test_a_motor_loses_torque_with_speed_where_it_drives_only():
+    robot = arm()
+    fast = 0.7 * robot.velocity_scale[0].item()
+    full = (2.0, 0.0, 0.0)
+    added = forces("torque_speed_limit", 1.0, qvel=fast, ctrl=full)["ctrl"]
+    assert added[0] == pytest.approx((1.2 - 0.7 - 1.0) * 2.0)
+    assert forces("torque_speed_limit", 1.0, qvel=-fast, ctrl=full)["ctrl"][0] == 0.0
+    assert forces("torque_speed_limit", 1.0, qvel=0.0, ctrl=full)["ctrl"] == [0.0] * 3
+
+
+def law_over_time(name, strength, commands, **options):
+    """Return what reaches the shoulder's motor while the arm is held."""
+    robot, law = arm(), effect(name, **options)
+    forcing, zero = Forcing(robot), torch.zeros(4, dtype=torch.float64)
+    active = [(law, torch.full((3,), strength).double())]
+    memories, passed = None, []
+    for command in commands:
+        ctrl = torch.tensor([command, 0.0, 0.0]).double()
+        state = Readings(qpos=zero, qvel=zero, ctrl=ctrl, time=zero[:1])
+        memories = forcing.start(active, state) if memories is None else memories
+        added, memories = forcing(active, memories, state)
+        passed.append(command + added["ctrl"][0].item())
+    return passed
+
+
+def test_a_gap_is_crossed_at_the_motor_s_speed_before_force_passes():
+    # full speed is 4 rad/s, a time step 2 ms: a gap of 0.02 rad takes 2.5 steps at full force
+    passed = law_over_time("backlash", 0.02, [2.0, 2.0, -2.0, -2.0, -2.0, -2.0, -1.0, 0.0, -1.0])
+    assert passed == [2.0, 2.0, 0.0, 0.0, -2.0, -2.0, -1.0, 0.0, -1.0]
+
+
+def test_a_spring_in_series_rings_at_its_resonance():
+    robot = arm()
+    stiffness = robot.model.dof_M0[0] * (2 * math.pi * 10) ** 2  # 10 Hz
+    passed = law_over_time("series_elasticity", 1 / stiffness, [0.0, *[1.0] * 500], damping=0.05)
+    passed = np.array(passed[1:])
+    peaks = np.flatnonzero((passed[1:-1] > passed[:-2]) & (passed[1:-1] > passed[2:]))
+    assert np.diff(peaks).mean() * 0.002 == pytest.approx(0.1, rel=0.02)
+    assert passed.max() > 1.6
+    assert passed[-1] == pytest.approx(1.0, abs=0.1)
+    assert passed[:3].max() < 0.2  # nothing passes at once
+
+
+def test_transmissions_have_no_place_on_actuators_of_unknown_force():
+    muscle = """
+    <mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody>
+    <actuator><general name="a" joint="j" dyntype="filter" dynprm="0.1"/></actuator></mujoco>"""
+    robot = robot_of(Task(model=mujoco.MjModel.from_xml_string(muscle), frame_skip=1))
+    for name in ("backlash", "torque_speed_limit", "series_elasticity"):
+        assert effect(name).targets(robot) == ()
+
+
+def test_actuator_forces_are_those_of_mujoco():
+    robot, rng = arm(), np.random.default_rng(0)
+    data = mujoco.MjData(robot.model)
+    data.qpos[:], data.qvel[:] = rng.normal(size=4), rng.normal(size=4)
+    data.ctrl[:] = [3.0, 0.4, -50.0]  # two beyond their limits
+    mujoco.mj_forward(robot.model, data)
+    now = Forcing(robot)._now(
+        Readings(
+            qpos=torch.from_numpy(data.qpos),
+            qvel=torch.from_numpy(data.qvel),
+            ctrl=torch.from_numpy(data.ctrl),
+            time=torch.zeros(1),
+        )
+    )
+    np.testing.assert_allclose(now.actuator_force, data.actuator_force, rtol=1e-12)
+    np.testing.assert_allclose(now.actuator_velocity, data.actuator_velocity, rtol=1e-12)
+    np.testing.assert_allclose(now.load, data.qfrc_actuator, rtol=1e-12)
+
+
+def test_effects_that_follow_see_a_changed_command():
+    robot, zero = arm(), torch.zeros(4, dtype=torch.float64)
+    state = Readings(qpos=zero, qvel=zero, ctrl=torch.tensor([2.0, 0.0, 0.0]).double(),
+                     time=zero[:1])  # fmt: skip
+    gap, friction = effect("series_elasticity"), effect("load_dependent_friction")
+    active = [(gap, torch.full((3,), 0.1).double()), (friction, torch.ones(4).double())]
+    forcing = Forcing(robot)
+    memories = [{"load": zero[:3], "rate": zero[:3]}, {}]
+    added, _ = forcing(active, memories, state)
+    passed = 2.0 + added["ctrl"][0]
+    assert added["dof_frictionloss"][0] == pytest.approx(2 * passed.item())
+
+
+# Model entries.
+
+
+def written(name, strength):
+    robot = arm()
+    models = ModelBatch(robot.model, 1)
+    law = effect(name)
+    fields = ModelFields(models)
+    values = strength_of(name, strength, law.targets(robot))
+    law.write(fields, values.expand(1, -1), robot)
+    fields.finish()
+    return models
+
+
+def test_entries():
+    model = arm().model
+    tilted = written("gravity_tilt", {"y": 0.1})
+    gravity = [tilted.read("opt.gravity", (i,)).item() for i in range(3)]
+    assert gravity == pytest.approx([-9.81 * math.sin(0.1), 0.0, -9.81 * math.cos(0.1)])
+    heavy = written("payload", {"lower": 0.5})
+    mass = model.body_mass[2]
+    assert heavy.read("body_mass", (2,)).item() == pytest.approx(mass + 0.5)
+    assert heavy.read("body_inertia", (2, 0)).item() == pytest.approx(
+        model.body_inertia[2, 0] * (mass + 0.5) / mass
+    )
+    assert heavy.read("body_subtreemass", (1,)).item() == pytest.approx(
+        model.body_subtreemass[1] + 0.5
+    )
+    assert written("com_shift", {"lower x": 0.05}).read("body_ipos", (2, 0)).item() == 0.05
+    assert written("link_length", {"lower": 0.1}).read("body_pos", (2, 2)).item() == pytest.approx(
+        -0.55
+    )
+    slippery = written("contact_friction", -0.5)
+    assert [slippery.read("geom_friction", (g, 0)).item() for g in range(4)] == [0.5] * 4
+    soft = written("contact_softness", 1.0)
+    assert soft.read("geom_solref", (0, 0)).item() == pytest.approx(0.04)
+    assert written("time_scale", -0.1).read("opt.timestep", ()).item() == pytest.approx(0.0018)
+    assert written("armature", {"elbow": 0.2}).read("dof_armature", (1,)) == pytest.approx(0.21)
+    assert written("viscous_friction", 0.1).read("dof_damping", (0,)).item() == pytest.approx(0.12)
+    assert written("parallel_spring", {"rail": 3.0}).read("jnt_stiffness", (2,)).item() == 3.0
+
+
+def test_stiffness_and_damping_of_a_contact_soften_like_its_time_constant():
+    box = """
+    <mujoco><worldbody><geom type="plane" size="1 1 1"/><body pos="0 0 1"><joint type="slide"/>
+    <geom size=".1" solref="-{} -{}"/></body></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(box.format(1000, 20))
+    robot, models = robot_of(Task(model=model, frame_skip=1)), ModelBatch(model, 1)
+    fields = ModelFields(models)
+    effect("contact_softness").write(fields, torch.ones(1, 1), robot)
+    assert models.read("geom_solref", (1, 0)).item() == -250.0
+    assert models.read("geom_solref", (1, 1)).item() == -10.0
+
+
+def test_a_centre_of_mass_that_mujoco_takes_for_fixed_is_no_target():
+    assert not any(t.startswith("sledge") for t in effect("com_shift").targets(arm()))
+
+
+def test_a_robot_that_touches_nothing_has_no_contacts_to_change():
+    pole = "<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>"
+    robot = robot_of(Task(model=mujoco.MjModel.from_xml_string(pole), frame_skip=1))
+    assert effect("contact_friction").targets(robot) == ()
+    assert effect("contact_friction").targets(arm()) == ("all",)
+
+
+def test_an_overlay_never_compounds_and_yields_to_what_was_written_since():
+    robot = robot_of(arm_task())
+    models = ModelBatch(robot.model, 2)
+    overlay, law = Overlay(models), effect("payload")
+    strength = strength_of("payload", {"lower": 1.0}, law.targets(robot)).expand(2, -1)
+    both, second = np.array([True, True]), np.array([False, True])
+    nominal = robot.model.body_mass[2]
+    for _ in range(3):
+        overlay.remove(both)
+        overlay.put(law, strength, robot, both)
+    np.testing.assert_allclose(models.read("body_mass", (2,)), nominal + 1.0)
+    models.write("body_mass", (2,), np.array([9.0, 9.0]), second)
+    overlay.remove(both)
+    np.testing.assert_allclose(models.read("body_mass", (2,)), [nominal, 9.0])
+    overlay.put(law, strength, robot, second)
+    np.testing.assert_allclose(models.read("body_mass", (2,)), [nominal, 10.0])
+    overlay.remove(both)
+    np.testing.assert_allclose(models.read("body_mass", (2,)), [nominal, 9.0])
+
+
+# Errors.
+
+
+def test_errors_say_what_is_wrong():
+    with pytest.raises(ValueError, match="a robot with a MuJoCo model"):
+        Forcing(ROBOT)
+    with pytest.raises(KeyError, match=r"a target of payload.*did you mean"):
+        strength_of("payload", {"foott": 1.0}, ("foot", "thigh"))
+    with pytest.raises(ValueError, match="one strength of payload for each"):
+        strength_of("payload", torch.zeros(3), ("foot", "thigh"))
+    with pytest.raises(ValueError, match="finite strengths of payload"):
+        strength_of("payload", [0.0, math.inf], ("foot", "thigh"))
+    with pytest.raises(ValueError, match="something that payload can act on"):
+        strength_of("payload", 1.0, ())
+
+
+def test_laws_of_one_s_own_are_short():
+    class Hysteresis(ActionEffect):
+        name, unit, group = "hysteresis", "fraction", "gain"
+
+        def command(self, action, strength, memory, now):
+            return action * (1 - strength * (memory["last"] * action < 0)), {"last": action}
+
+        def start(self, action):
+            return {"last": torch.zeros_like(action)}
+
+        def bounds(self, robot):
+            return torch.zeros(len(robot.actuators)), torch.ones(len(robot.actuators))
+
+    sequence = command_sequence(Hysteresis(), column(1, -1, -1), torch.tensor([0.5]), ROBOT)
+    assert sequence[:, 0].tolist() == [1.0, -0.5, -1.0]
+    now = SimpleNamespace(robot=ROBOT)
+    assert Hysteresis().command(column(1)[0], torch.zeros(1), {"last": column(1)[0]}, now)[0] == 1
