@@ -15,6 +15,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
 
 from .columns import joint_names
 from .finding import Finding, runs
@@ -134,7 +135,7 @@ def _agreement(motion: Motion, velocity: Array, time: Array) -> Iterator[Found]:
             return
         if correlation > 0.9:
             yield from _lag(change, travelled, span, steps)
-    yield from _outliers(change - travelled, change, velocity, steps)
+    yield from _outliers(motion, change - travelled, velocity, steps)
 
 
 def _over(values: Array, span: int) -> Array:
@@ -160,14 +161,15 @@ def _lag(change: Array, travelled: Array, span: int, steps: Array) -> Iterator[F
         yield "velocity_lag", np.ones(len(change) + 1, dtype=bool), text, "warning"
 
 
-def _outliers(error: Array, change: Array, velocity: Array, steps: Array) -> Iterator[Found]:
+def _outliers(motion: Motion, error: Array, velocity: Array, steps: Array) -> Iterator[Found]:
     """Find jumps of position and spikes of velocity that the other one does not share."""
+    change = np.diff(motion.position)
     scale = 1.4826 * np.median(np.abs(error - np.median(error)))
-    floor = 0.05 * np.sqrt(np.mean(velocity**2)) * steps
-    speed = np.abs(velocity)
-    near = np.maximum(speed[1:], speed[:-1])
-    near = np.maximum(near, np.maximum(np.append(near[1:], 0.0), np.append(0.0, near[:-1])))
-    jumps = np.abs(change) > 1.5 * near * steps + 10 * scale + floor
+    floor = 0.05 * np.sqrt(np.mean(velocity**2)) * steps + 3 * lattice_step(motion.position)
+    near = maximum_filter1d(np.maximum(np.abs(velocity[1:]), np.abs(velocity[:-1])), 3)
+    # beside a repeated sample a step catches up: the repetition is reported, not the step
+    odd = maximum_filter1d((change == 0).astype(int), 5) == 0
+    jumps = odd & (np.abs(change) > 2.5 * near * steps + 10 * scale + floor)
     rare = 0.02 * len(steps) + 1
     if jumps.any():
         marked = np.append(jumps, False) | np.append(False, jumps)
@@ -177,7 +179,7 @@ def _outliers(error: Array, change: Array, velocity: Array, steps: Array) -> Ite
     both = np.minimum(np.abs(error[1:]), np.abs(error[:-1])) > 8 * scale + floor[1:]
     rise, fall = np.diff(velocity)[:-1], -np.diff(velocity)[1:]
     alone = np.minimum(rise * np.sign(rise), fall * np.sign(rise)) > 2 * np.abs(rise - fall)
-    spikes = signs & both & alone & ~jumps[1:] & ~jumps[:-1]
+    spikes = signs & both & alone & ~jumps[1:] & ~jumps[:-1] & odd[1:] & odd[:-1]
     if spikes.any():
         marked = np.concatenate([[False], spikes, [False]])
         text = f"{spikes.sum()} spike(s) of its velocity that it does not follow"
@@ -235,7 +237,7 @@ def lattice_step(values: Array) -> float:
         0.0
     """
     levels = np.unique(values)
-    if len(levels) < 3 or len(levels) > len(values) / 3:
+    if len(levels) < 3 or len(levels) > 0.8 * len(values):
         return 0.0
     gaps = np.diff(levels)
     gaps = gaps[gaps > 1e-9 * np.ptp(levels)]

@@ -134,8 +134,8 @@ def _resolution(records: Sequence[Record], system: System) -> Iterator[Finding]:
                     steps.setdefault(f"{motion.name}{name}", []).append(pair)
     for name, pairs in steps.items():
         step, span = np.median(pairs, axis=0)
-        if step > 1e-3 * span > 0:
-            text = f"{name} has a resolution of {step:.3g}, {step / span:.1%} of its span"
+        if step > 2e-4 * span > 0:
+            text = f"{name} has a resolution of {step:.3g}, {step / span:.2%} of its span"
             yield _general("resolution", text)
 
 
