@@ -220,6 +220,18 @@ def test_a_gap_is_crossed_at_the_motor_s_speed_before_force_passes():
     assert passed == [2.0, 2.0, 0.0, 0.0, -2.0, -2.0, -1.0, 0.0, -1.0]
 
 
+def test_a_law_called_less_often_takes_longer_steps():
+    robot, zero = arm(), torch.zeros(4, dtype=torch.float64)
+    state = Readings(qpos=zero, qvel=zero, ctrl=torch.ones(3).double(), time=zero[:1])
+    forcing, active = Forcing(robot), [(effect("backlash"), torch.full((3,), 0.05).double())]
+    start = [{"gap": torch.full((3,), -0.025).double()}]
+    _, (once,) = forcing(active, start, state, timestep=0.006)
+    memories = start
+    for _ in range(3):
+        _, memories = forcing(active, memories, state)
+    torch.testing.assert_close(once["gap"], memories[0]["gap"])
+
+
 def test_a_spring_in_series_rings_at_its_resonance():
     robot = arm()
     stiffness = robot.model.dof_M0[0] * (2 * math.pi * 10) ** 2  # 10 Hz
@@ -253,7 +265,8 @@ def test_actuator_forces_are_those_of_mujoco():
             qvel=torch.from_numpy(data.qvel),
             ctrl=torch.from_numpy(data.ctrl),
             time=torch.zeros(1),
-        )
+        ),
+        0.002,
     )
     np.testing.assert_allclose(now.actuator_force, data.actuator_force, rtol=1e-12)
     np.testing.assert_allclose(now.actuator_velocity, data.actuator_velocity, rtol=1e-12)

@@ -10,13 +10,14 @@ from __future__ import annotations
 __all__ = ["Forcing"]
 
 from collections.abc import Sequence
+from functools import cached_property
 from types import SimpleNamespace
 
 import torch
 from torch import Tensor
 
 from ..envs.task import Readings
-from .effect import ForceEffect, Memory, Now
+from .effect import ForceEffect, Memory
 from .robot import Robot
 
 _WHERE = {
@@ -54,16 +55,7 @@ class Forcing:
         model = robot.require_model()
         self.robot, self._nv, self._timestep = robot, model.nv, float(model.opt.timestep)
         self._qpos, self._dofs = list(robot.qpos_index), list(robot.dof_index)
-        # joint forces per actuator force, shape (A, J)
-        self._moment = torch.zeros(model.nu, len(self._dofs), dtype=torch.float64)
-        for i, joint in enumerate(robot.joint_of_actuator):
-            if joint >= 0:
-                self._moment[i, joint] = float(model.actuator_gear[i, 0])
-        self._gain = torch.from_numpy(model.actuator_gainprm[:, 0].copy())
-        affine = torch.from_numpy(model.actuator_biastype != 0)[:, None]
-        self._bias = torch.where(affine, torch.from_numpy(model.actuator_biasprm[:, :3].copy()), 0)
-        self._ctrl_limits = _limits(model.actuator_ctrllimited, model.actuator_ctrlrange)
-        self._force_limits = _limits(model.actuator_forcelimited, model.actuator_forcerange)
+        self._actuators = _Actuators(robot)
 
     def start(self, active: Active, state: Readings) -> list[Memory]:
         """Return the memories at the beginning, for the batch of ``state``."""
@@ -71,7 +63,12 @@ class Forcing:
         return [effect.start(velocity) for effect, _ in active]
 
     def __call__(
-        self, active: Active, memories: Sequence[Memory], state: Readings
+        self,
+        active: Active,
+        memories: Sequence[Memory],
+        state: Readings,
+        *,
+        timestep: float | None = None,
     ) -> tuple[dict[str, Tensor], list[Memory]]:
         """Return what is added in the coming time step, and the memories after it.
 
@@ -80,12 +77,13 @@ class Forcing:
                 seen by the effects that follow.
             memories: As returned by `start` or the last call.
             state: ``qpos``, ``qvel``, ``time`` and ``ctrl``, shape ``(*batch, size)``.
+            timestep: Seconds until the next call; default the model's time step.
 
         Returns:
             Any of ``qfrc_applied``, ``dof_frictionloss`` and ``dof_damping``, ``(*batch, nv)``, and
             ``ctrl``, ``(*batch, nu)``.
         """
-        now = self._now(state)
+        now = self._now(state, self._timestep if timestep is None else timestep)
         added: dict[str, Tensor] = {}
         after = []
         for (effect, strength), memory in zip(active, memories, strict=True):
@@ -94,35 +92,74 @@ class Forcing:
             for kind, value in given.items():
                 if kind == "command":
                     added["ctrl"] = added["ctrl"] + value if "ctrl" in added else value
-                    self._command(now, now.command + value)
+                    now = now.under(now.command + value)
                 else:
                     name = _WHERE[kind]
                     if name not in added:
-                        shape = (*torch.broadcast_shapes(value.shape, now.velocity.shape)[:-1],)
+                        shape = torch.broadcast_shapes(value.shape, now.velocity.shape)[:-1]
                         added[name] = value.new_zeros(*shape, self._nv)
                     added[name][..., self._dofs] += value
         return added, after
 
-    def _now(self, state: Readings) -> Now:
-        now = SimpleNamespace(robot=self.robot, timestep=self._timestep, noise=None)
-        now.time = state.time
-        now.position = state.qpos[..., self._qpos]
-        now.velocity = state.qvel[..., self._dofs]
-        now.actuator_gain = self._gain
-        now.actuator_velocity = now.velocity @ self._moment.T
-        self._command(now, state.ctrl)
-        return now
+    def _now(self, state: Readings, timestep: float) -> _TimeStep:
+        return _TimeStep(
+            robot=self.robot,
+            timestep=timestep,
+            time=state.time,
+            position=state.qpos[..., self._qpos],
+            velocity=state.qvel[..., self._dofs],
+            command=state.ctrl,
+            actuator_gain=self._actuators.gain,
+            actuators=self._actuators,
+            noise=None,
+        )
 
-    def _command(self, now: Now, command: Tensor) -> None:
-        """Set the command, and the forces that it exerts."""
-        now.command = command
-        low, high = self._ctrl_limits
-        length = now.position @ self._moment.T
-        force = self._gain * command.clamp(low, high)
-        force = force + self._bias[:, 0] + self._bias[:, 1] * length
-        force = force + self._bias[:, 2] * now.actuator_velocity
-        now.actuator_force = force.clamp(*self._force_limits)
-        now.load = now.actuator_force @ self._moment
+
+class _TimeStep(SimpleNamespace):
+    """What laws may look at; forces of actuators are computed when one does."""
+
+    def under(self, command: Tensor) -> _TimeStep:
+        """Return the same time step under another command."""
+        values = vars(self) | {"command": command}
+        computed = "actuator_force", "load"
+        return _TimeStep(**{k: v for k, v in values.items() if k not in computed})
+
+    @cached_property
+    def actuator_velocity(self) -> Tensor:
+        return self.velocity @ self.actuators.moment.T
+
+    @cached_property
+    def actuator_force(self) -> Tensor:
+        return self.actuators.force(self.command, self.position, self.actuator_velocity)
+
+    @cached_property
+    def load(self) -> Tensor:
+        return self.actuator_force @ self.actuators.moment
+
+
+class _Actuators:
+    """Actuators as MuJoCo computes them: a gain and an affine bias, within limits."""
+
+    def __init__(self, robot: Robot) -> None:
+        model = robot.require_model()
+        # joint forces per actuator force, shape (A, J)
+        self.moment = torch.zeros(model.nu, len(robot.joints), dtype=torch.float64)
+        for i, joint in enumerate(robot.joint_of_actuator):
+            if joint >= 0:
+                self.moment[i, joint] = float(model.actuator_gear[i, 0])
+        self.gain = torch.from_numpy(model.actuator_gainprm[:, 0].copy())
+        affine = torch.from_numpy(model.actuator_biastype != 0)[:, None]
+        self._bias = torch.where(affine, torch.from_numpy(model.actuator_biasprm[:, :3].copy()), 0)
+        self._command_limits = _limits(model.actuator_ctrllimited, model.actuator_ctrlrange)
+        self._force_limits = _limits(model.actuator_forcelimited, model.actuator_forcerange)
+
+    def force(self, command: Tensor, position: Tensor, velocity: Tensor) -> Tensor:
+        """Return the force of each, given joint positions and the actuators' own velocities."""
+        force = self.gain * command.clamp(*self._command_limits) + self._bias[:, 0]
+        if self._bias[:, 1:].any():  # a servo
+            force = force + self._bias[:, 1] * (position @ self.moment.T)
+            force = force + self._bias[:, 2] * velocity
+        return force.clamp(*self._force_limits)
 
 
 def _limits(limited: object, ranges: object) -> tuple[Tensor, Tensor]:

@@ -35,6 +35,8 @@ class ApplyEffect(Transform):
     step and those on the model at resets of a MuJoCo environment. Hidden state starts anew where
     an environment resets. Beside an `ApplyPhysics`, put it after that: at a reset the parameters
     are written first, and the effect changes what is then in force, never its own last change.
+    Effects on the model are written after the simulator's own reset, whose observation is the one
+    without them.
 
     Args:
         effect: The effect, or its name in the catalogue.

@@ -1,0 +1,81 @@
+import mujoco
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_bayessim.envs.additions import rollout_with, steps_with
+from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+from torchrl_bayessim.envs.stepper import Stepper
+
+SLEDGE = """
+<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body>
+<joint name="rail" type="slide" axis="1 0 0" frictionloss="0"/>
+<geom type="box" size=".1 .1 .1" mass="2"/></body></worldbody>
+<actuator><motor joint="rail"/></actuator></mujoco>
+"""
+
+
+def sledge():
+    return mujoco.MjModel.from_xml_string(SLEDGE)
+
+
+def test_a_force_and_a_command_move_a_mass_as_newton_says():
+    def push(now):
+        return {"qfrc_applied": torch.full_like(now.qvel, 3.0), "ctrl": torch.ones_like(now.ctrl)}
+
+    model = sledge()
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 2.0
+    steps_with(model, data, [push], count=10)
+    assert data.qvel[0] == pytest.approx((3 + 1 + 2) / 2 * 0.1)
+    assert (data.ctrl[0], data.qfrc_applied[0]) == (2.0, 0.0)
+    stepper = Stepper(sledge(), 2, threads=1)
+    outputs = rollout_with(stepper, [push], np.full((2, 5, 1), 2.0), substeps=2)
+    np.testing.assert_allclose(outputs[:, -1, 1], data.qvel[0])
+    assert (stepper["qfrc_applied"] == 0).all()
+
+
+def test_additions_see_the_commands_of_those_before_and_every_time_step():
+    seen = []
+
+    def double(now):
+        return {"ctrl": now.ctrl.clone()}
+
+    def watch(now):
+        seen.append((round(float(now.time.max()), 3), float(now.ctrl.max())))
+        return {}
+
+    rollout_with(Stepper(sledge(), 1, threads=1), [double, watch], np.ones((1, 1, 1)), substeps=3)
+    assert seen == [(0.0, 2.0), (0.01, 2.0), (0.02, 2.0)]
+
+
+def test_friction_and_damping_are_added_to_what_each_simulation_has():
+    def resist(now):
+        return {"dof_damping": now.qvel.abs(), "dof_frictionloss": torch.ones_like(now.qvel)}
+
+    stepper = Stepper(sledge(), 2, threads=1)
+    stepper.models.write("dof_frictionloss", (0,), np.array([0.0, 2.0]))
+    outputs = rollout_with(stepper, [resist], np.full((2, 1, 1), 2.5), substeps=1)
+    # under 2.5 N the first slides with 1 N of friction; 3 N hold the second, but for the tenth of
+    # the motion that the constraint, being soft, lets through (solimp 0.9)
+    assert outputs[0, 0, 1] == pytest.approx((2.5 - 1.0) / 2 * 0.01, rel=0.05)
+    assert outputs[1, 0, 1] == pytest.approx(0.1 * 2.5 / 2 * 0.01, rel=0.05)
+    np.testing.assert_array_equal(stepper.models.read("dof_frictionloss", (0,)), [0.0, 2.0])
+    np.testing.assert_array_equal(stepper.models.read("dof_damping", (0,)), [0.0, 0.0])
+
+
+def test_an_addition_of_nothing_changes_no_bit():
+    plain, other = (BatchedMujocoEnv("Hopper-v5", 2, threads=1) for _ in range(2))
+    other.add("nothing", lambda now: {"qfrc_applied": torch.zeros_like(now.qvel)})
+    plain.reset(), other.reset()
+    action = TensorDict({"action": torch.full((2, 3), 0.4)}, [2])
+    for _ in range(5):
+        one, two = (env.step(action.clone())["next"] for env in (plain, other))
+        assert torch.equal(one["observation"], two["observation"])
+
+
+def test_a_task_with_commands_of_its_own_takes_no_additions():
+    env = BatchedMujocoEnv("FetchReach-v4", 1, threads=1)
+    with pytest.raises(ValueError, match="a task whose commands are its controls"):
+        env.add("nothing", lambda now: {})
