@@ -24,6 +24,7 @@ from torchrl_bayessim.effects.sequence import (
     restored_sequence,
 )
 from torchrl_bayessim.effects.strength import strength_of
+from torchrl_bayessim.effects.units import unit_at
 from torchrl_bayessim.envs.model_batch import ModelBatch
 from torchrl_bayessim.envs.task import Readings, Task
 
@@ -348,7 +349,27 @@ def test_a_robot_that_touches_nothing_has_no_contacts_to_change():
     pole = "<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>"
     robot = robot_of(Task(model=mujoco.MjModel.from_xml_string(pole), frame_skip=1))
     assert effect("contact_friction").targets(robot) == ()
-    assert effect("contact_friction").targets(arm()) == ("all",)
+    robot = arm()
+    assert effect("contact_friction").targets(robot) == ("all",)
+    robot.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    assert effect("contact_friction").targets(robot) == ()
+
+
+def test_units_are_those_of_the_joint_or_channel():
+    robot = arm()
+    units = {
+        name: [unit_at(effect(name), robot, i) for i in range(len(effect(name).targets(robot)))]
+        for name in ("viscous_friction", "backlash", "sensor_bias", "sensor_drift", "payload",
+                     "gravity_tilt")
+    }  # fmt: skip
+    assert units["viscous_friction"] == ["N m s/rad", "N m s/rad", "N s/m", "N s/m"]
+    assert units["backlash"] == ["rad", "rad", "m"]
+    assert units["sensor_bias"] == ["rad", "rad", "m", "m", "rad/s", "rad/s", "m/s", "m/s"]
+    assert units["sensor_drift"][::4] == ["rad/s", "rad/s²"]
+    assert units["payload"] == ["kg"] * 3
+    assert units["gravity_tilt"] == ["rad", "rad"]
+    bare = Robot(dt=0.1, channels=("a",), channel_joint=(-1,), channel_kind=("other",))
+    assert unit_at(effect("sensor_bias"), bare, 0) == "channel"
 
 
 def test_an_overlay_never_compounds_and_yields_to_what_was_written_since():

@@ -23,7 +23,7 @@ class _Contact(ModelEffect):
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return ``all``, nothing for a model without contacts."""
         model = robot.model
-        if model is None:
+        if model is None or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
             return ()
         touching = any(_meet(model, a, b) for a in range(model.ngeom) for b in range(a))
         return ("all",) if touching or model.npair else ()

@@ -63,7 +63,8 @@ class Effect(ABC):
 
     Attributes:
         name: Its name in the catalogue.
-        unit: Of the strength: SI, or ``fraction``.
+        unit: Of the strength: SI, for hinges where that differs from slides (`units`), or
+            ``fraction``, ``command`` or ``channel`` for the command's or channel's own.
         group: Effects of one group act alike; where data cannot tell them apart they are reported
             together: ``timing``, ``friction``, ``gain``, ``offset``, ``elasticity``, ``inertia``,
             ``contact``, ``geometry``, ``noise``, ``disturbance``.
