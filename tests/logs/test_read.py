@@ -124,6 +124,9 @@ def test_a_saved_tensordict_cannot_run_code(tmp_path, pendulum):
     data.memmap(tmp_path / "saved")
     with pytest.raises(ValueError, match="a tensordict without pickles"):
         read_logs(tmp_path / "saved", pendulum)
+    empty = TensorDict({name: torch.zeros(0) for name in ("t", "q", "qd", "tau")}, [0])
+    with pytest.raises(ValueError, match="at least one log"):
+        read_logs(empty, pendulum)
     with pytest.raises(ValueError, match="batch size"):
         read_logs(TensorDict({"q": torch.zeros(3)}, []), pendulum)
 

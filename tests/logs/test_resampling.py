@@ -123,6 +123,12 @@ def test_rotations_follow_the_motion(box):
     assert gain > 0
 
 
+def test_a_table_without_rows_is_no_record(pendulum):
+    empty = {name: np.zeros(0) for name in pendulum.columns.used()}
+    with pytest.raises(ValueError, match=r"rows in log\.parquet, got 0"):
+        record_of(Table("log.parquet", empty), pendulum)
+
+
 def test_quaternions_do_not_change_sign(box):
     time, qpos, qvel = tumbling(box.task.model, 0.01, 60)
     flipped = qpos.copy()

@@ -354,3 +354,38 @@ def test_partly_measured_robots_are_checked_as_far_as_they_go():
     (log, *_) = usable_logs(records, system, findings)
     assert log.measured.tolist() == [False, True, False, False]
     assert float(log.qpos[:, 0].abs().max()) == 0.0
+
+
+def first_rows(record, count):
+    return replace(
+        record, **{n: getattr(record, n)[:count] for n in ("time", "qpos", "qvel", "ctrl")}
+    )
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda r: times(r, factor_q=np.nan),
+        lambda r: times(r, factor_v=np.nan),
+        lambda r: times(r, factor_u=np.nan),
+        lambda r: times(r, factor_q=1e200),
+        lambda r: replace(r, time=np.nan * r.time),
+        lambda r: replace(r, time=0 * r.time),
+        lambda r: replace(r, time=r.time[::-1].copy()),
+        lambda r: first_rows(r, 1),
+        lambda r: first_rows(r, 4),
+    ],
+)
+def test_logs_that_say_nothing_are_not_used(change):
+    findings, records, system = spoilt(change)
+    assert "short" in kinds(findings)
+    with pytest.raises(ValueError, match=r"logs that can be used, got 'error: 0\.csv"):
+        usable_logs(records, system, findings)
+
+
+def test_nothing_at_all_and_nothing_that_moves():
+    system, records = simulated("arm")
+    with pytest.raises(ValueError, match="at least one log"):
+        check([], system)
+    at_rest = [times(r, factor_q=0.0, factor_v=0.0) for r in records]
+    assert "constant_channel" in kinds(check(at_rest, system), "warning")

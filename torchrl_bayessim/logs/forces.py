@@ -171,7 +171,7 @@ def _pushed(
 
 def _push(record: Record, log: Log, joint: str, *, rows: tuple[int, int]) -> Finding:
     begin, end = (float(log.time[row]) for row in rows)
-    first, last = np.searchsorted(record.time, [begin - 1e-9, end + 1e-9])
+    first, last = (int(np.nanargmin(np.abs(record.time - time))) for time in (begin, end))
     text = (
         f"between {begin:.2f} and {end:.2f} s {joint} is pushed by more than twice the largest "
         "force of its actuators: an impact, a hand, or lost samples"
@@ -179,7 +179,7 @@ def _push(record: Record, log: Log, joint: str, *, rows: tuple[int, int]) -> Fin
     return Finding(
         kind="push",
         file=record.name,
-        rows=(int(first), min(int(last), len(record)) - 1),
+        rows=(first, last),
         message=text,
         severity="error",
     )

@@ -19,7 +19,7 @@ from scipy.ndimage import maximum_filter1d
 
 from .columns import joint_names
 from .finding import Finding, runs
-from .record import Record, unwrapped, wraps
+from .record import Record, plausible, unwrapped, wraps
 from .system import System
 
 Array = NDArray[np.float64]
@@ -62,15 +62,15 @@ def motions(record: Record, system: System) -> list[Motion]:
 def check_channels(record: Record, system: System) -> Iterator[Finding]:
     """Yield what is wrong with the positions and velocities of a record."""
     good = np.isfinite(record.time) & (np.diff(record.time, prepend=-np.inf) > 0)
-    rows = np.flatnonzero(good)
-    if len(rows) < 10:
-        return
     for motion in motions(record, system):
+        known = good & plausible(motion.position)
+        if motion.velocity is not None:
+            known &= plausible(motion.velocity)
+        rows = np.flatnonzero(known)
+        if len(rows) < 10:
+            continue
         speed = None if motion.velocity is None else motion.velocity[rows]
         seen = motion._replace(position=motion.position[rows], velocity=speed)
-        values = [seen.position] if speed is None else [seen.position, speed]
-        if not np.isfinite(values).all():
-            continue
         for kind, marked, text, severity in _findings(seen, record.time[rows]):
             parts = tuple((int(rows[a]), int(rows[b])) for a, b in runs(marked))
             yield Finding(

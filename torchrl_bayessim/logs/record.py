@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["Record", "record_of", "unwrapped", "wraps"]
+__all__ = ["Record", "plausible", "record_of", "unwrapped", "usable_rows", "wraps"]
 
 from dataclasses import dataclass
 
@@ -43,10 +43,12 @@ def record_of(table: Table, system: System) -> Record:
     """Return a table's columns in the simulator's quantities.
 
     Raises:
-        ValueError: A quaternion is far from a unit quaternion.
+        ValueError: There are no rows, or a quaternion is far from a unit quaternion.
     """
     model, columns = system.task.model, system.columns
     length = len(next(iter(table.columns.values())))
+    if not length:
+        raise ValueError(message(f"rows in {table.name}", 0))
     qpos = np.full((length, model.nq), np.nan)
     qvel = np.full((length, model.nv), np.nan)
     ctrl = np.full((length, model.nu), np.nan)
@@ -66,6 +68,22 @@ def record_of(table: Table, system: System) -> Record:
     else:
         time = table.columns[columns.time].copy()
     return Record(name=table.name, time=time, qpos=qpos, qvel=qvel, ctrl=ctrl)
+
+
+def plausible(values: Array) -> NDArray[np.bool_]:
+    """Return which values are numbers that a robot can have: finite, and below 1e8."""
+    return (values > -1e8) & (values < 1e8)
+
+
+def usable_rows(record: Record, system: System) -> NDArray[np.bool_]:
+    """Return which rows have all values that the system's columns promise, shape ``(T,)``."""
+    model, columns = system.task.model, system.columns
+    good = plausible(record.ctrl).all(1)
+    for j, joint in enumerate(joint_names(model)):
+        q, v = model.jnt_qposadr[j], model.jnt_dofadr[j]
+        good &= plausible(record.qpos[:, q : q + len(columns.qpos.get(joint, ()))]).all(1)
+        good &= plausible(record.qvel[:, v : v + len(columns.qvel.get(joint, ()))]).all(1)
+    return good
 
 
 def _continuous(quaternions: Array, file: str, joint: str) -> Array:

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import message
 from .columns import joint_names
 from .log import Log
-from .record import Record, unwrapped
+from .record import Record, unwrapped, usable_rows
 from .system import System
 from .velocity import Windows, angular_velocity, velocity
 
@@ -58,12 +58,7 @@ def resample(
 
 def _parts(record: Record, system: System, leave_out: Iterable[tuple[int, int]]) -> Iterator[slice]:
     """Yield slices of consecutive usable rows."""
-    good = np.isfinite(record.time)
-    for values in (record.qpos, record.qvel, record.ctrl):
-        finite = np.isfinite(values)
-        good &= finite[:, finite.any(0)].all(1)  # all but what was never measured
-    if record.ctrl.size and not np.isfinite(record.ctrl).any(0).all():
-        good[:] = False
+    good = np.isfinite(record.time) & usable_rows(record, system)
     for first, last in leave_out:
         good[first : last + 1] = False
     steps = np.diff(record.time)
@@ -72,7 +67,7 @@ def _parts(record: Record, system: System, leave_out: Iterable[tuple[int, int]])
         row = int(np.flatnonzero(backward)[0]) + 1
         got = f"{record.time[row]:g} s after {record.time[row - 1]:g} s in row {row}"
         raise ValueError(message(f"increasing time in {record.name}", got))
-    usual = np.median(steps[np.isfinite(steps)]) if len(record) > 1 else system.control_dt
+    usual = np.median(steps[good[1:] & good[:-1]]) if (good[1:] & good[:-1]).any() else 0.0
     together = good[1:] & good[:-1] & (steps <= _GAP * max(usual, system.control_dt))
     edges = np.flatnonzero(~together) + 1
     for begin, end in zip([0, *edges], [*edges, len(record)], strict=True):

@@ -19,7 +19,7 @@ from .finding import Finding
 from .forces import check_forces
 from .kinematics import check_channels, lattice_step, motions
 from .log import Log
-from .record import Record
+from .record import Record, plausible, usable_rows
 from .resampling import resample
 from .system import System
 from .timestamps import check_time
@@ -33,6 +33,9 @@ def check(records: Sequence[Record], system: System, *, horizon: int = 10) -> li
         system: The robot.
         horizon: Control steps that a log must have at least.
 
+    Raises:
+        ValueError: There is no log.
+
     Example:
         >>> from torchrl_bayessim.envs.tasks.catalogue import known_task
         >>> system = System(task=known_task("InvertedPendulum-v5"))
@@ -44,11 +47,13 @@ def check(records: Sequence[Record], system: System, *, horizon: int = 10) -> li
         >>> finding.kind, finding.severity, finding.rows
         ('degrees', 'error', (0, 49))
     """
+    if not records:
+        raise ValueError(message("at least one log", "none"))
     found: list[Finding] = []
     for record in records:
         found += check_time(record, system.control_dt)
         found += check_channels(record, system)
-        found += _missing(record)
+        found += _missing(record, system)
     found += _copies(records)
     found += _resolution(records, system)
     found += _actions(records, system)
@@ -98,16 +103,11 @@ def _general(kind: str, text: str) -> Finding:
     return Finding(kind=kind, file="", rows=(0, 0), message=text)
 
 
-def _missing(record: Record) -> Iterator[Finding]:
-    """Find values that are missing in some rows, or in all where they are needed."""
-    bad = np.zeros(len(record), dtype=bool)
-    for values in (record.qpos, record.qvel):
-        finite = np.isfinite(values)
-        bad |= ~finite[:, finite.any(0)].all(1)
-    bad |= ~np.isfinite(record.ctrl).all(1)
-    if bad.any():
-        rows = np.flatnonzero(bad)
-        text = f"{len(rows)} row(s) with values that are missing, left out"
+def _missing(record: Record, system: System) -> Iterator[Finding]:
+    """Find rows with values that are missing."""
+    rows = np.flatnonzero(~usable_rows(record, system))
+    if len(rows):
+        text = f"{len(rows)} row(s) with values that are missing or beyond 1e8, left out"
         place = int(rows[0]), int(rows[-1])
         yield Finding(kind="missing", file=record.name, rows=place, message=text)
 
@@ -124,16 +124,18 @@ def _copies(records: Sequence[Record]) -> Iterator[Finding]:
 
 
 def _resolution(records: Sequence[Record], system: System) -> Iterator[Finding]:
-    """Find channels whose values are multiples of a step that is not small."""
+    """Find channels that never change, or only by multiples of a step that is not small."""
     steps: dict[str, list[tuple[float, float]]] = {}
     for record in records:
         for motion in motions(record, system):
             for name, values in ("", motion.position), (" velocity", motion.velocity):
-                if values is not None and np.isfinite(values).all():
+                if values is not None and plausible(values).all():
                     pair = lattice_step(values), float(np.ptp(values))
                     steps.setdefault(f"{motion.name}{name}", []).append(pair)
     for name, pairs in steps.items():
         step, span = np.median(pairs, axis=0)
+        if max(span for _, span in pairs) == 0:
+            yield _general("constant_channel", f"{name} never changes")
         if step > 2e-4 * span > 0:
             text = f"{name} has a resolution of {step:.3g}, {step / span:.2%} of its span"
             yield _general("resolution", text)
@@ -142,11 +144,12 @@ def _resolution(records: Sequence[Record], system: System) -> Iterator[Finding]:
 def _actions(records: Sequence[Record], system: System) -> Iterator[Finding]:
     model = system.task.model
     for i, name in enumerate(actuator_names(model)):
-        ranges = [np.ptp(record.ctrl[:, i]) for record in records]
-        if not np.nanmax(ranges) > 0:
+        values = [r.ctrl[:, i][plausible(r.ctrl[:, i])] for r in records]
+        values = [v for v in values if len(v)]
+        if all(np.ptp(v) == 0 for v in values):
             yield _general("constant_action", f"the action {name} never changes")
         low, high = model.actuator_ctrlrange[i]
-        largest = np.nanmax([np.nanmax(np.abs(record.ctrl[:, i])) for record in records])
+        largest = max((np.abs(v).max() for v in values), default=0.0)
         if model.actuator_ctrllimited[i] and largest > 1.5 * max(-low, high):
             text = f"the action {name} reaches {largest:.3g}, and the model clips it to {high:.3g}"
             yield _general("action_range", text)

@@ -155,6 +155,8 @@ def tensordict_tables(data: TensorDictBase | Path, system: System) -> list[Table
             raise ValueError(message(expected, reason)) from None
     if not data.ndim:
         raise ValueError(message(f"a tensordict of batch size (*, T) in {name}", "none"))
+    if 0 in data.shape:
+        return []
     done = data.get(("next", "done"), None)
     rows = data.exclude("next").reshape(-1, data.shape[-1])
     ends = torch.zeros(rows.shape) if done is None else done.reshape(*rows.shape, -1).any(-1)
