@@ -78,7 +78,7 @@ def plausible(values: Array) -> NDArray[np.bool_]:
 def usable_rows(record: Record, system: System) -> NDArray[np.bool_]:
     """Return which rows have all values that the system's columns promise, shape ``(T,)``."""
     model, columns = system.task.model, system.columns
-    good = plausible(record.ctrl).all(1)
+    good = np.asarray(plausible(record.ctrl).all(1))
     for j, joint in enumerate(joint_names(model)):
         q, v = model.jnt_qposadr[j], model.jnt_dofadr[j]
         good &= plausible(record.qpos[:, q : q + len(columns.qpos.get(joint, ()))]).all(1)

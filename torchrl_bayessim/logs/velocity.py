@@ -119,6 +119,8 @@ def _fitted(windows: Windows, near: Callable[[Rows], Array]) -> tuple[Array, flo
         # a row differs from itself by zero, so what is fitted there is the residual
         residual = (smooth * differences).sum(-1) / (1 - leverage)
         fits.append((np.mean(residual**2), half, (slope * differences).sum(-1), slope))
+        if fits[-1][0] > 2 * min(error for error, *_ in fits):
+            break  # wider windows only bend more
     best = min(error for error, *_ in fits)
     _, half, result, slope = [fit for fit in fits if fit[0] <= 1.05 * best][-1]
     return result, float(np.median(np.linalg.norm(slope, axis=1))), half
