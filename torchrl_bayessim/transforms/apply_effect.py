@@ -15,12 +15,11 @@ from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform
 
 from ..effects.catalogue import effect as known_effect
 from ..effects.effect import ActionEffect, Effect, ForceEffect, Memory, ModelEffect, SensorEffect
-from ..effects.forcing import Forcing
 from ..effects.memory import renewed
 from ..effects.overlay import Overlay
+from ..effects.push import Push
 from ..effects.robot import Robot
 from ..effects.strength import Strength, strength_of
-from ..envs.task import Readings
 from ..errors import message
 from ..physics.mujoco_models import models_of
 from ..randomness import generator
@@ -81,8 +80,9 @@ class ApplyEffect(Transform):
         self._shared: dict[str, Any] = {"robot": robot, "strength": strength, "identity": object()}
         self._random = generator(seed, self.effect.name)
         self._memory: Memory | None = None
+        self._action = torch.zeros(0)  # the last one, for its shape
         self._steps = torch.zeros(0)  # since the episode began, shape (*batch, 1)
-        self._overlay: Overlay | None = None
+        self._acting: Push | Overlay | None = None  # on the simulator
         if robot is not None:
             self.strength = strength
 
@@ -148,13 +148,18 @@ class ApplyEffect(Transform):
         if self.key is None:
             acts = isinstance(self.effect, ActionEffect)
             self.key = self.parent.action_key if acts else "observation"
+        # Noted on the environment under what clones share, since TorchRL makes clones of transforms
+        # to say what comes before others: they are the same effect, once, with one hidden state.
+        acting, identity = env.__dict__.setdefault("_effects", {}), self._shared["identity"]
         if isinstance(self.effect, ForceEffect):
-            self._forcing = Forcing(self.robot)
-            add_every_time_step(env, self._shared["identity"], self._push)
+            if identity not in acting:
+                shared = self._shared
+                acting[identity] = Push(self.effect, self.robot, lambda: shared["strength"])
+            add_every_time_step(env, identity, acting[identity])
         elif isinstance(self.effect, ModelEffect):
-            overlays = env.__dict__.setdefault("_overlays", {})  # clones share it
             models = models_of(env)
-            self._overlay = overlays.setdefault(self._shared["identity"], Overlay(models))
+            acting.setdefault(identity, Overlay(models))
+        self._acting = acting.get(identity)
 
     def know(self, env: EnvBase, outside: EnvBase | None = None) -> None:
         """Learn from a simulator what there is to act on, where no robot was given.
@@ -207,6 +212,7 @@ class ApplyEffect(Transform):
         action = tensordict.get(self.key)
         if self._memory is None:
             self._memory = self.effect.start(action)
+        self._action = action
         now, strength = self._now(action)
         changed, self._memory = self.effect.command(action, strength, self._memory, now)
         self._steps = self._steps + 1
@@ -218,15 +224,6 @@ class ApplyEffect(Transform):
             self._steps = self._steps + 1
             self._show(next_tensordict, None)
         return next_tensordict
-
-    def _push(self, state: Readings) -> dict[str, Tensor]:
-        """Return what a force effect adds in the coming time step."""
-        assert isinstance(self.effect, ForceEffect)
-        active = [(self.effect, self.strength)]
-        if self._memory is None:
-            (self._memory,) = self._forcing.start(active, state)
-        added, (self._memory,) = self._forcing(active, [self._memory], state)
-        return added
 
     def _show(self, tensordict: TensorDictBase, mask: Tensor | None) -> None:
         """Replace the observation by what is measured of it, in ``mask`` or everywhere."""
@@ -255,8 +252,8 @@ class ApplyEffect(Transform):
     # What happens at a reset.
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
-        if self._overlay is not None:
-            self._overlay.remove(self._rows(tensordict))
+        if isinstance(self._acting, Overlay):
+            self._acting.remove(self._rows(tensordict))
         return tensordict
 
     def _reset(
@@ -266,13 +263,16 @@ class ApplyEffect(Transform):
         self._steps = torch.where(mask.unsqueeze(-1), 0.0, self._steps)
         if isinstance(self.effect, SensorEffect):
             self._show(tensordict_reset, mask)
-        elif isinstance(self.effect, ModelEffect):
-            assert self._overlay is not None
+        elif isinstance(self._acting, Push):
+            self._acting.begin(mask)
+        elif isinstance(self._acting, Overlay):
+            assert isinstance(self.effect, ModelEffect)
             rows = self._rows(tensordict)
             strength = self.strength.expand(len(rows), -1)
-            self._overlay.put(self.effect, strength, self.robot, rows)
+            self._acting.put(self.effect, strength, self.robot, rows)
         elif self._memory is not None:
-            self._memory = renewed(self._memory, self._beginning(), mask)
+            assert isinstance(self.effect, ActionEffect)
+            self._memory = renewed(self._memory, self.effect.start(self._action), mask)
         return tensordict_reset
 
     def _rows(self, tensordict: TensorDictBase | None) -> Any:
@@ -281,16 +281,6 @@ class ApplyEffect(Transform):
         if tensordict is None:
             return torch.ones(self.parent.batch_size, dtype=torch.bool).reshape(-1).numpy()
         return resets(self.parent, tensordict).reshape(-1).numpy()
-
-    def _beginning(self) -> Memory:
-        assert self.parent is not None
-        batch = self.parent.batch_size
-        if isinstance(self.effect, ActionEffect):
-            spec = self.parent.full_action_spec[self.key]
-            return self.effect.start(torch.zeros(spec.shape, dtype=spec.dtype))
-        assert isinstance(self.effect, ForceEffect)
-        joints = len(self.robot.joints)
-        return self.effect.start(torch.zeros(*batch, joints, dtype=torch.float64))
 
     def __repr__(self) -> str:
         return f"ApplyEffect({self.effect.name}, strength={self.strength})"
