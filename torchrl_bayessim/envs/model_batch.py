@@ -49,7 +49,7 @@ _SCALARS = {
     "opt.o_margin": ("opt.gravity", 11),
     "stat.meaninertia": ("stat.center", -4),
 }
-_SHARE = 8  # environments that are worth another thread
+_SHARE = 32  # environments that are worth another thread
 
 
 def _attribute(model: mujoco.MjModel, field: str) -> Any:
