@@ -43,8 +43,19 @@ def test_the_loss_reported_is_that_of_the_loss_module(prior, weighted, covarianc
         train["weight"], held["weight"] = torch.ones(64), torch.arange(40.0)
     _, validation = descend(net, train, held, epochs=3, **OPTIONS)
     with torch.no_grad():
+        widened = PosteriorLoss(net)(held)["loss_posterior"].item()
+        net.network.widening.fill_(1.0)
         expected = PosteriorLoss(net)(held)["loss_posterior"].item()
     assert min(validation) == pytest.approx(expected, abs=1e-4)
+    assert widened <= expected + 1e-6
+
+
+def test_a_network_that_learned_few_pairs_by_heart_is_widened():
+    prior = BoxPrior({"a": (0.0, 1.0), "b": (0.0, 1.0)})
+    net = MixtureDensityPosterior(prior, 2, components=1)
+    _, validation = descend(net, pairs(prior, 24), pairs(prior, 200, key=1), epochs=60, **OPTIONS)
+    assert validation[-1] > min(validation)
+    assert net.network.widening > 1
 
 
 def test_the_box_comes_in_before_the_end():
@@ -53,9 +64,9 @@ def test_the_box_comes_in_before_the_end():
     theta = prior.sample((3000,), generator=generator(1))
     data = TensorDict({"theta": theta, "summary": torch.zeros(3000, 2)}, [3000])
     net = MixtureDensityPosterior(prior, 2, components=1)
-    descend(net, data[:1500], data[1500:], epochs=12, **OPTIONS)
+    descend(net, data[:1500], data[1500:], epochs=16, **OPTIONS)
     density = net.distribution(torch.zeros(2)).log_prob(torch.tensor([[0.0], [0.5], [1.0]]))
-    assert density.abs().max() < 0.15
+    assert density.abs().max() < 0.3  # one Gaussian without the box: 1.1 apart
 
 
 def test_the_learning_rate_rises_once_and_falls_to_nothing():

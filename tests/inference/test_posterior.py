@@ -330,7 +330,7 @@ def test_paper_mode_learns_and_keeps_to_the_support(features):
     posterior = MixtureDensityPosterior.paper_mode(prior, 2, features=features)
     report = fit(posterior, data, epochs=40, progress=False)
     assert report.best < -1.0  # the prior's is 0
-    q = posterior.condition(data["summary"][:4], pooling="mean")
+    q = posterior.condition(data["summary"][:4], pooling="mean", check=False)
     assert prior.contains(q.sample((100,))).all()
 
 

@@ -18,6 +18,8 @@ from .descent import descend
 from .features import FourierFeatures
 from .posterior import MixtureDensityPosterior
 
+_SEEN = 1000  # summaries kept to compare real ones with
+
 
 @dataclass(frozen=True)
 class FitReport:
@@ -78,12 +80,12 @@ def fit(
     posterior: MixtureDensityPosterior,
     data: TensorDictBase,
     *,
-    epochs: int = 60,
+    epochs: int = 100,
     batch_size: int = 128,
     lr: float = 1e-2,
     weight_decay: float = 1e-4,
     validation_fraction: float = 0.1,
-    patience: int = 20,
+    patience: int = 25,
     rescale: bool = True,
     seed: int = 0,
     progress: bool = True,
@@ -130,6 +132,8 @@ def fit(
     validation, train = pairs[order[:held_out]], pairs[order[held_out:]].contiguous()
     if rescale:
         posterior.network.standardize_inputs(train.get(posterior.summary_key))
+    posterior.seen = train.get(posterior.summary_key)[:_SEEN]
+    posterior.held_out = None if "weight" in pairs.keys() else validation  # noqa: SIM118
     trace = descend(
         posterior,
         train,

@@ -115,7 +115,8 @@ def doubts(summaries: Tensor, observed: Tensor, posterior: PhysicsPosterior) -> 
             f"{len(apart)} of {len(checks)} real summaries lie as far out as the {level:.1%} of "
             f"{compared} simulated ones that are furthest from the others. The statistics most "
             f"off, in units of their spread: {shown}. Does the prior hold the real parameters, and "
-            "the simulator all that the robot does?"
+            "the simulator all that the robot does? If the prior is right, no parameter explains "
+            "these data: torchrl_bayessim.diagnosis finds what the simulator lacks."
         )
     found += [
         f"{share:.0%} of the posterior of {name!r} lie at the {edge} edge of {posterior.prior!r}. "

@@ -49,6 +49,7 @@ class MixtureDensityNetwork(nn.Module):
 
     shift: Tensor
     scale: Tensor
+    widening: Tensor  # of all deviations, where a fit was found too sure
 
     def __init__(
         self,
@@ -87,6 +88,7 @@ class MixtureDensityNetwork(nn.Module):
             loc.copy_((1.2 * (2 * start.draw(components) - 1)).flatten())
         self.register_buffer("shift", torch.zeros(features.dim))
         self.register_buffer("scale", torch.ones(features.dim))
+        self.register_buffer("widening", torch.ones(()))
 
     def standardize_inputs(self, summaries: Tensor) -> None:
         """Set the input scaling from training summaries ``(N, L)``; constant ones are ignored."""
@@ -112,7 +114,7 @@ class MixtureDensityNetwork(nn.Module):
         logits, loc, diagonal, lower = raw.split(self.sizes, -1)
         shape = (*summary.shape[:-1], self.components, self.parameters_)
         loc = self.reach * torch.tanh(loc.reshape(shape) / self.reach)
-        deviation = melu(diagonal.reshape(shape)).sqrt()
+        deviation = self.widening * melu(diagonal.reshape(shape)).sqrt()
         deviation = WIDEST * torch.tanh(deviation / WIDEST)
         rows = torch.diag_embed(torch.ones_like(deviation))
         if self.covariance == "full" and self.parameters_ > 1:

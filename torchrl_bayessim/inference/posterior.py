@@ -15,11 +15,12 @@ from __future__ import annotations
 
 __all__ = ["MixtureDensityPosterior"]
 
+import warnings
 from functools import partial
 from typing import Literal
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
@@ -29,6 +30,7 @@ from torch import Tensor
 
 from ..errors import message
 from .features import Features, FourierFeatures, NeuralFeatures
+from .misspecification import doubts
 from .mixtures import Mixture
 from .network import Covariance, MixtureDensityNetwork
 from .physics_posterior import PhysicsPosterior
@@ -58,6 +60,10 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         in_key: Key of the summaries, shape ``(*, L)``.
         out_key: Key of the parameters, shape ``(*, D)``.
         seed: Of the initial weights and frequencies.
+
+    Attributes:
+        seen: Summaries that it was fitted to, up to a thousand; ``None`` before a fit.
+        held_out: Pairs that chose the best epoch of an unweighted fit.
 
     Example:
         >>> from tensordict import TensorDict
@@ -111,6 +117,8 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         ]
         super().__init__(*modules)  # pyright: ignore[reportCallIssue, reportArgumentType]
         self.prior, self.summary_key, self.theta_key = prior, in_key, out_key
+        self.seen: Tensor | None = None
+        self.held_out: TensorDictBase | None = None
 
     @classmethod
     def paper_mode(
@@ -165,8 +173,13 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         )
 
     @torch.no_grad()
-    def condition(self, summaries: Tensor, *, pooling: Pooling = "product") -> PhysicsPosterior:
+    def condition(
+        self, summaries: Tensor, *, pooling: Pooling = "product", check: bool = True
+    ) -> PhysicsPosterior:
         r"""Return the posterior given the summaries of n real trajectories together.
+
+        Warns if they lie apart from all the summaries that it was fitted to, or if the posterior
+        piles up at an edge: see :mod:`.misspecification`.
 
         Args:
             summaries: Shape ``(n, L)`` or ``(L,)``; trajectories may differ in length.
@@ -174,6 +187,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
                 posterior of independent trajectories, so that more data sharpen it;
                 ``"mean"``: the posterior of the averaged summary, as the paper does, which does
                 not become sharper with n.
+            check: Whether to look for reasons to doubt the result.
 
         Raises:
             ValueError: For no summaries, wrong shapes, NaN or infinite statistics.
@@ -197,12 +211,16 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
             )
         # sums and matrix products round a row differently at another place
         summaries = summaries[sorted(range(len(summaries)), key=summaries.tolist().__getitem__)]
-        if pooling == "mean":
-            return self.distribution(summaries.mean(0))
-        if pooling != "product":
+        if pooling not in {"product", "mean"}:
             raise ValueError(message("a pooling", pooling, available=["product", "mean"]))
+        if pooling == "mean":
+            summaries = summaries.mean(0, keepdim=True)
         each = self.distribution(summaries).mixture
-        return PhysicsPosterior(pool(each, bounded=self.prior.box is not None), self.prior)
+        found = PhysicsPosterior(pool(each, bounded=self.prior.box is not None), self.prior)
+        if check and self.seen is not None:
+            for doubt in doubts(self.seen, summaries, found):
+                warnings.warn(doubt, stacklevel=2)
+        return found
 
     def extra_repr(self) -> str:
         """Show the prior."""

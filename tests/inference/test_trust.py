@@ -1,0 +1,83 @@
+import warnings
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_bayessim.inference.fit import fit
+from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
+from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.inference.trust import trust
+from torchrl_bayessim.randomness import generator
+
+PRIOR = BoxPrior({"mass": (0.0, 1.0), "link length 2": (0.0, 1.0)})
+
+
+def simulate(theta, key="trust"):
+    noise = 0.05 * torch.randn(len(theta), 2, generator=generator(key))
+    return torch.cat([theta[:, :1], 2 * theta[:, :1]], -1) + noise
+
+
+@pytest.fixture(scope="module")
+def network():
+    theta = PRIOR.sample((1000,), generator=generator(0))
+    net = MixtureDensityPosterior(PRIOR, 2)
+    pairs = TensorDict({"theta": theta, "summary": simulate(theta)}, [1000])
+    fit(net, pairs, epochs=20, progress=False)
+    return net
+
+
+def test_real_data_from_the_simulator_are_believed(network):
+    found = trust(network, torch.tensor([0.4, 0.8]), simulate=simulate)
+    assert found.doubts == ()
+    assert found.calibration.passed
+    assert found.predictive > 0.05
+    assert found.identifiability.names == PRIOR.names
+    said = str(found)
+    assert "These data say nothing about link length 2" in said
+    assert "These data say much about mass" in said
+    assert said.endswith("No reason to doubt this posterior.")
+
+
+def test_a_robot_that_no_parameter_explains_is_doubted(network):
+    """The two statistics agree in every simulation; the robot's do not."""
+    found = trust(network, torch.tensor([0.8, 0.4]), simulate=simulate)
+    said = str(found)
+    assert "no parameter explains these data: torchrl_bayessim.diagnosis" in said
+    assert "simulations at the posterior lie as far out" in said
+    assert found.predictive < 0.01
+
+
+def test_conditioning_far_from_all_simulations_warns(network):
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        network.condition(torch.tensor([40.0, 80.0]))
+    apart = [
+        str(warning.message) for warning in seen if "lie as far out as" in str(warning.message)
+    ]
+    assert len(apart) == 1
+    assert "no parameter explains these data" in apart[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        network.condition(torch.tensor([0.4, 0.8]))
+        network.condition(torch.tensor([40.0, 80.0]), check=False)
+
+
+def test_a_network_that_is_too_sure_is_doubted(network):
+    theta = PRIOR.sample((200,), generator=generator(1))
+    noisy = simulate(theta, "other") + 0.2 * torch.randn(200, 2, generator=generator(2))
+    pairs = TensorDict({"theta": theta, "summary": noisy}, [200])
+    found = trust(network, torch.tensor([0.4, 0.8]), held_out=pairs)
+    assert not found.calibration.passed
+    assert any("too sure" in doubt for doubt in found.doubts)
+
+
+def test_few_held_out_pairs_tell_nothing(network):
+    assert (
+        trust(network, torch.tensor([0.4, 0.8]), held_out=network.held_out[:49]).calibration is None
+    )
+
+
+def test_a_network_without_a_fit_is_refused():
+    with pytest.raises(ValueError, match=r"a fitted network, got 'one that is not'\. Try: fit"):
+        trust(MixtureDensityPosterior(PRIOR, 2), torch.zeros(2))
