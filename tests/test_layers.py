@@ -11,7 +11,16 @@ ROOT = Path(torchrl_bayessim.__file__).parent
 # long as no cycle arises.
 LAYERS = [
     {"errors", "randomness"},
-    {"sources", "trajectories", "checkpoint", "plots", "physics", "envs", "evaluation"},
+    {
+        "sources",
+        "sbi_source",
+        "trajectories",
+        "checkpoint",
+        "plots",
+        "physics",
+        "envs",
+        "evaluation",
+    },
     {"summaries", "episode_draws", "remote_source", "inference", "agents", "replay", "effects"},
     {"logs"},
     {"transforms"},

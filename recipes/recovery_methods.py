@@ -1,0 +1,233 @@
+"""The methods of the posterior-recovery table, behind one interface.
+
+A method turns pairs into something that answers for many summaries at once (amortised: BayesSim,
+Rejection ABC, sbi's NPE), or a simulator into an answer for one observation (MCMC-ABC, SMC-ABC,
+epsilon-free). An answer gives each parameter's log-density and the truth's place in its marginal.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import warnings
+from collections.abc import Callable
+from contextlib import chdir, redirect_stdout
+from dataclasses import dataclass
+from tempfile import TemporaryDirectory
+from typing import Literal
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torchrl_bayessim.inference.calibration import calibrate
+from torchrl_bayessim.inference.fit import fit, select_lengthscale
+from torchrl_bayessim.inference.marginals import marginal_log_prob
+from torchrl_bayessim.inference.physics_posterior import PhysicsPosterior
+from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
+from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.inference.sequential import sequential
+from torchrl_bayessim.randomness import generator, isolated
+from torchrl_bayessim.sources import draw
+
+Simulator = Callable[[Tensor], Tensor]
+ACCEPTED = 0.05  # share of the simulations that Rejection ABC accepts
+DRAWS = 200
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a method says about truths, each given its own summary.
+
+    Attributes:
+        marginal: Log-density of each parameter at the truth, shape ``(N, D)``.
+        place: Share of each marginal below the truth, shape ``(N, D)``.
+        joint: Log-density of all parameters together, ``(N,)``; ``None`` for draws.
+    """
+
+    marginal: Tensor
+    place: Tensor
+    joint: Tensor | None = None
+
+
+Fitted = Callable[[Tensor, Tensor], Answer]
+"""Truths ``(N, D)`` and their summaries ``(N, L)`` to an answer."""
+
+
+def bayessim(
+    prior: BoxPrior,
+    theta: Tensor,
+    x: Tensor,
+    *,
+    features: Literal["fourier", "neural"],
+    covariance: Literal["diagonal", "full"],
+    paper: bool,
+    seed: int,
+) -> tuple[Fitted, MixtureDensityPosterior]:
+    """Fit BayesSim's network with the paper's choices or our defaults."""
+    size = x.shape[-1]
+    pairs = TensorDict({"theta": theta, "summary": x}, [len(theta)])
+    network = MixtureDensityPosterior(
+        prior, size, features=features, covariance=covariance, seed=seed
+    )
+    if paper:
+        own = MixtureDensityPosterior.paper_mode(prior, size, features=features, seed=seed)
+        network = MixtureDensityPosterior(
+            prior,
+            size,
+            components=own.network.components,
+            covariance=covariance,
+            features=own.network.features,
+            compress=False,
+            seed=seed,
+        )
+    if features == "fourier":
+        select_lengthscale(network, pairs, factors=(1, 2, 4), epochs=12, progress=False)
+    fit(network, pairs, seed=seed, progress=False)
+
+    @torch.no_grad()
+    def answer(truth: Tensor, summary: Tensor) -> Answer:
+        q = network.distribution(summary)
+        test = TensorDict({"theta": truth, "summary": summary}, [len(truth)])
+        place = calibrate(network, test, draws=DRAWS, seed=seed).rank
+        return Answer(marginal_log_prob(q, truth), place, q.log_prob(truth))
+
+    return answer, network
+
+
+def rejection_abc(prior: BoxPrior, theta: Tensor, x: Tensor) -> Fitted:
+    """Accept the simulations nearest to each summary, in robustly standardised statistics."""
+    low, median, high = x.quantile(torch.tensor([0.25, 0.5, 0.75]), 0)
+    spread = torch.where(high > low, (high - low) / 1.35, x.std(0)).clamp_min(1e-12)
+
+    def scaled(values: Tensor) -> Tensor:
+        return ((values - median) / spread).clamp(-10, 10)
+
+    def answer(truth: Tensor, summary: Tensor) -> Answer:
+        distance = torch.cdist(scaled(summary), scaled(x))
+        nearest = distance.topk(round(ACCEPTED * len(x)), largest=False).indices
+        return from_draws(prior, truth, theta[nearest].transpose(0, 1))
+
+    return answer
+
+
+def from_draws(prior: BoxPrior, truth: Tensor, draws: Tensor) -> Answer:
+    """Return the answer of draws ``(S, N, D)``: kernel densities, reflected at the box's edges."""
+    low, width = prior.low, prior.high - prior.low
+    u, at = (draws - low) / width, (truth - low) / width
+    bandwidth = 1.06 * u.std(0).clamp_min(1e-4) * len(u) ** -0.2
+    images = torch.stack([u, -u, 2 - u])
+    kernel = -0.5 * ((at - images) / bandwidth).square() - bandwidth.log()
+    density = kernel.flatten(0, 1).logsumexp(0) - 0.5 * math.log(2 * math.pi) - math.log(len(u))
+    place = ((u < at).float().sum(0) + 0.5) / (len(u) + 1)
+    return Answer(density - width.log(), place)
+
+
+def npe(
+    prior: BoxPrior, theta: Tensor, x: Tensor, *, kind: Literal["mdn", "maf", "nsf"], seed: int
+) -> Fitted:
+    """Fit sbi's NPE with its own defaults; densities are renormalised inside the prior."""
+    from sbi.inference import NPE
+    from sbi.utils import BoxUniform
+
+    with (
+        TemporaryDirectory() as logs,
+        chdir(logs),
+        isolated(seed, "sbi", kind),
+        redirect_stdout(io.StringIO()),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore")
+        inference = NPE(
+            BoxUniform(prior.low, prior.high), density_estimator=kind, show_progress_bars=False
+        )
+        estimator = inference.append_simulations(theta, x).train()
+
+    @torch.no_grad()
+    def answer(truth: Tensor, summary: Tensor) -> Answer:
+        with isolated(seed, "sbi draws", kind):
+            draws = estimator.sample((2 * DRAWS,), condition=summary)
+        inside = prior.contains(draws)
+        share = inside.float().mean(0).clamp_min(0.5 / len(draws))
+        joint = estimator.log_prob(truth[None], condition=summary)[0] - share.log()
+        below = (inside.unsqueeze(-1) & (draws < truth)).sum(0)
+        place = (below + 0.5) / (inside.sum(0).unsqueeze(-1) + 1)
+        within = torch.where(inside.unsqueeze(-1), draws, truth)  # the few outside do not count
+        marginal = from_draws(prior, truth, within).marginal
+        if len(prior.names) == 1:
+            marginal = joint.unsqueeze(-1)
+        return Answer(marginal, place, joint)
+
+    return answer
+
+
+def mcmc_abc(
+    simulate: Simulator, prior: BoxPrior, observed: Tensor, *, budget: int, seed: int
+) -> Tensor:
+    """Return draws by Metropolis chains side by side (Marjoram et al., 2003), shape ``(S, D)``.
+
+    A quarter of the budget is a pilot, which sets the scale of the statistics, the tolerance (its
+    5 % quantile of distances), the starts (each of four chains) and the steps of the chains.
+    """
+    g = generator(seed, "mcmc")
+    theta = draw(prior, budget // 4, key=(seed, "pilot"))
+    x = simulate(theta)
+    spread = x.std(0).clamp_min(1e-12)
+    distance = ((x - observed) / spread).norm(dim=-1)
+    tolerance = distance.quantile(ACCEPTED)
+    chain = theta[distance <= tolerance].repeat(4, 1)
+    step = 1.5 * chain.std(0).clamp_min(1e-3)
+    kept = []
+    for _ in range((budget - len(theta)) // len(chain)):
+        proposal = chain + step * torch.randn(chain.shape, generator=g)
+        inside = prior.contains(proposal)
+        proposal = torch.where(inside.unsqueeze(-1), proposal, chain)
+        near = ((simulate(proposal) - observed) / spread).norm(dim=-1) <= tolerance
+        chain = torch.where((near & inside).unsqueeze(-1), proposal, chain)
+        kept.append(chain)
+    return torch.cat(kept[len(kept) // 4 :])
+
+
+def smc_abc(
+    simulate: Simulator, prior: BoxPrior, observed: Tensor, *, budget: int, seed: int
+) -> Tensor:
+    """Return draws of sbi's SMC-ABC, shape ``(S, D)``; statistics in units of a pilot's spread."""
+    from sbi.inference import SMCABC
+    from sbi.utils import BoxUniform
+
+    pilot = simulate(draw(prior, budget // 10, key=(seed, "pilot")))
+    spread = pilot.std(0).clamp_min(1e-12)
+    with isolated(seed, "smc"), redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        inference = SMCABC(
+            lambda theta: simulate(theta) / spread,
+            BoxUniform(prior.low, prior.high),
+            simulation_batch_size=100,
+            show_progress_bars=False,
+        )
+        return inference(
+            (observed / spread)[None],
+            num_particles=min(100, budget // 4),
+            num_initial_pop=budget // 4,
+            num_simulations=budget - budget // 10,
+            epsilon_decay=0.7,
+        )
+
+
+def epsilon_free(
+    simulate: Simulator, prior: BoxPrior, observed: Tensor, *, budget: int, seed: int
+) -> PhysicsPosterior:
+    """Return the posterior of four rounds with a Gaussian proposal, corrected analytically."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the counts of repaired components
+        *_, last = sequential(
+            simulate,
+            prior,
+            observed[None],
+            rounds=4,
+            simulations=budget // 4,
+            correction="analytic",
+            seed=seed,
+            progress=False,
+        )
+    return last.posterior

@@ -1,0 +1,81 @@
+"""The table of recovered parameters from its command line, as users run it."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+RECIPE = Path(__file__).parent.parent / "recipes" / "posterior_recovery.py"
+
+
+def run(*arguments, folder):
+    done = subprocess.run(
+        [sys.executable, str(RECIPE), "progress=false", *arguments],
+        cwd=folder,
+        env=os.environ | {"PYTHONWARNINGS": "ignore"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recovery")
+    status, out, err = run("short=true", "problem=pendulum", "out=run", folder=folder)
+    assert status == 0, err
+    return folder, out
+
+
+def test_rows_have_what_others_read(finished):
+    folder, out = finished
+    result = json.loads((folder / "run/result.json").read_text())
+    assert json.loads(out.splitlines()[-1].removeprefix("RESULT ")) == result
+    assert {row["method"] for row in result["rows"]} == {"BayesSim", "Rejection ABC"}
+    for row in result["rows"]:
+        assert {
+            *("problem", "parameter", "method", "log_prob_mean", "log_prob_sd", "nats_over_prior"),
+            *("coverage_50", "coverage_90", "seconds_simulate", "seconds_fit", "simulations"),
+            *("seeds", "paper_best"),
+        } <= row.keys()
+        assert (row["problem"], row["parameter"]) == ("pendulum", "dt")
+        assert (row["simulations"], row["seeds"], row["truths"]) == (200, 2, 32)
+        assert row["paper_best"] == 3.199
+        assert 0 <= row["coverage_50"] <= row["coverage_90"] <= 1
+    assert result["provenance"]["seed"] == 0
+
+
+def test_a_parameter_is_recovered_better_than_by_the_prior(finished):
+    folder, _ = finished
+    rows = json.loads((folder / "run/result.json").read_text())["rows"]
+    found = {row["method"]: row for row in rows}
+    assert found["BayesSim"]["nats_over_prior"] > 1
+    assert found["BayesSim"]["nats_over_prior"] > found["Rejection ABC"]["nats_over_prior"]
+
+
+def test_table_and_picture_are_there(finished):
+    folder, _ = finished
+    table = (folder / "run/table.md").read_text()
+    assert "| paper, best | 3.20 | |" in table
+    assert "These data say much about dt" in table
+    assert (folder / "run/pendulum.png").stat().st_size > 5000
+
+
+def test_finished_parts_are_not_run_again(finished):
+    folder, _ = finished
+    parts = sorted((folder / "run/parts").iterdir())
+    before = [path.stat().st_mtime_ns for path in parts]
+    status, _, err = run("short=true", "problem=pendulum", "out=run", folder=folder)
+    assert status == 0, err
+    assert [path.stat().st_mtime_ns for path in parts] == before
+
+
+def test_an_unknown_problem_ends_in_one_line(tmp_path):
+    status, _, err = run("problem=pendulumm", folder=tmp_path)
+    assert status == 2
+    assert "expected a problem, got 'pendulumm'. Available: pendulum (did you mean" in err

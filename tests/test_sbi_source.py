@@ -1,0 +1,78 @@
+import warnings
+
+import pytest
+import torch
+from torchrl.envs import Compose, TransformedEnv
+
+from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
+from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.physics.attributes import AttributePhysics
+from torchrl_bayessim.randomness import generator, isolated
+from torchrl_bayessim.sbi_source import SbiSource
+from torchrl_bayessim.sources import draw
+from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
+
+PRIOR = BoxPrior({"length": (0.1, 2.0), "masspole": (0.1, 2.0)})
+
+
+@pytest.fixture(scope="module")
+def posterior(tmp_path_factory):
+    """Return a real one, of NPE, fitted to summaries that are the parameters and a little noise."""
+    pytest.importorskip("sbi")
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(), isolated("sbi"):
+        warnings.simplefilter("ignore")
+        from sbi.inference import NPE
+        from sbi.utils import BoxUniform
+
+        patch.chdir(tmp_path_factory.mktemp("sbi"))
+        theta = PRIOR.sample((300,), generator=generator(0))
+        x = theta + 0.05 * torch.randn(theta.shape, generator=generator(1))
+        trainer = NPE(
+            BoxUniform(PRIOR.low, PRIOR.high), density_estimator="mdn", show_progress_bars=False
+        )
+        trainer.append_simulations(theta, x).train(learning_rate=5e-3, max_num_epochs=100)
+        return trainer.build_posterior()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_an_sbi_posterior_randomises_a_simulator(posterior):
+    randomizer = DomainRandomizer(PRIOR)
+    physics = ApplyPhysics(AttributePhysics(*PRIOR.names))
+    env = TransformedEnv(CartPoleEnv(64), Compose(physics, randomizer))
+    randomizer.source = SbiSource(posterior, torch.tensor([0.7, 1.5]), names=PRIOR.names)
+    held = env.reset()["theta"]
+    assert PRIOR.contains(held).all()
+    assert held.mean(0).tolist() == pytest.approx([0.7, 1.5], abs=0.25)
+    assert held.std(0).min() > 0.005
+    assert not torch.equal(env.reset()["theta"], held)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_the_same_key_gives_the_same_draws(posterior):
+    source = SbiSource(posterior, torch.tensor([0.7, 1.5]), names=PRIOR.names)
+    before = torch.random.get_rng_state()
+    first, again, other = (draw(source, 5, key=(key,)) for key in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert source.log_prob(first).shape == (5,)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_other_names_than_parameters_are_refused(posterior):
+    source = SbiSource(posterior, torch.tensor([0.7, 1.5]), names=["length"])
+    with pytest.raises(ValueError, match=r"draws of the 1 parameters length, got \(3, 2\)"):
+        draw(source, 3, key=(0,))
+
+
+def test_what_cannot_be_sampled_is_refused():
+    with pytest.raises(TypeError, match="an sbi posterior with `sample`, got 'object'"):
+        SbiSource(object(), names=["a"])
+
+
+def test_sbi_is_not_imported_by_the_module():
+    import subprocess
+    import sys
+
+    code = "import sys, torchrl_bayessim.sbi_source; assert 'sbi' not in sys.modules"
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
