@@ -116,7 +116,7 @@ class DeadBand(ActionEffect):
     In units of the command, 0 to 40 % of ``u_max``.
     """
 
-    name, unit, group, memoryless = "dead_band", "command", "friction", True
+    name, unit, group, memoryless = "dead_band", "command", "dead zone", True
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.4 ``u_max``."""

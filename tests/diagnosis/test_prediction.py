@@ -1,0 +1,175 @@
+"""The batched replay of a diagnosis and the drop-in transform give the same trajectories."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from torchrl.envs import TransformedEnv
+
+from torchrl_bayessim.diagnosis.objective import units_of
+from torchrl_bayessim.diagnosis.prediction import Predictor
+from torchrl_bayessim.diagnosis.segments import cut
+from torchrl_bayessim.effects.catalogue import CATALOGUE, effect
+from torchrl_bayessim.effects.effect import SensorEffect
+from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+from torchrl_bayessim.envs.task import Task
+from torchrl_bayessim.envs.tasks.catalogue import known_task
+from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.logs.log import Log
+from torchrl_bayessim.logs.system import System
+from torchrl_bayessim.physics.mujoco import MujocoPhysics
+from torchrl_bayessim.transforms.apply_effect import ApplyEffect
+
+ARM = """
+<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+  <body name="upper"><joint name="shoulder" axis="0 1 0" damping=".05"/>
+    <inertial pos="0 0 -.2" mass="1" diaginertia=".02 .02 .01"/>
+    <body name="lower" pos="0 0 -.4"><joint name="elbow" axis="0 1 0" damping=".05"/>
+      <inertial pos="0 0 -.15" mass=".5" diaginertia=".01 .01 .005"/></body></body>
+</worldbody><actuator>
+  <motor name="m1" joint="shoulder" ctrlrange="-5 5"/>
+  <motor name="m2" joint="elbow" ctrlrange="-2 2"/>
+</actuator></mujoco>
+"""
+STEPS = 45
+STRONG = {"torque_speed_limit", "saturation"}  # act on strong commands only
+
+
+def arm():
+    return Task(model=mujoco.MjModel.from_xml_string(ARM), frame_skip=5)
+
+
+def actions(task, count=STEPS):
+    spans = torch.from_numpy(task.model.actuator_ctrlrange[:, 1]).float()
+    times = torch.arange(count)[:, None] * task.dt
+    return spans * torch.sin(torch.tensor([9.0, 24.0, 16.0])[: len(spans)] * times + 0.3)
+
+
+def recorded(task, applied=None, start=None):
+    """Return what an environment does, as a log of measured positions and velocities."""
+    env = BatchedMujocoEnv(task, 1, threads=1, dtype=torch.float64)
+    base = env
+    if applied is not None:
+        env = TransformedEnv(env, ApplyEffect(*applied))
+    td = env.reset()
+    model = task.model
+    qpos = torch.from_numpy(model.qpos0.copy()) if start is None else start
+    base.place({"qpos": qpos[None], "qvel": torch.zeros(1, model.nv)})
+    rows = [(base.stepper["qpos"].copy(), base.stepper["qvel"].copy())]
+    commanded = actions(task)
+    for action in commanded:
+        td = env.step(td.set("action", action[None]))["next"]
+        td = td.exclude("reward")
+        rows.append((base.stepper["qpos"].copy(), base.stepper["qvel"].copy()))
+    last = torch.cat([commanded, commanded[-1:]]).double()
+    return Log(
+        name="env",
+        time=torch.arange(STEPS + 1).double() * task.dt,
+        qpos=torch.from_numpy(np.concatenate([q for q, _ in rows])),
+        qvel=torch.from_numpy(np.concatenate([v for _, v in rows])),
+        ctrl=last,
+        velocity_gain=torch.zeros(model.nv).double(),
+        measured=torch.ones(2 * model.nv, dtype=torch.bool),
+    )
+
+
+def deterministic(robot):
+    units = units_of([effect(name) for name in CATALOGUE], robot)
+    units = [u for u in units if not u.effect.random and not isinstance(u.effect, SensorEffect)]
+    idle = "com_shift[upper y]", "com_shift[lower y]"  # along the axis of all joints
+    return {str(u): u for u in units if u.where != "all" and str(u) not in idle}
+
+
+ARM_UNITS = deterministic(System(task=arm()).robot)
+
+
+def worst(task, log, unit=None, strength=0.0):
+    system = System(task=task)
+    predictor = Predictor(system, threads=1)
+    predictor.exact = True
+    strengths = {}
+    if unit is not None:
+        strengths[unit.effect] = strength * np.array([unit.direction])
+    residual = predictor.residuals(cut([log], STEPS, history=2), np.zeros((1, 0)), strengths)
+    return np.abs(residual).max()
+
+
+@pytest.mark.parametrize("name", ARM_UNITS)
+def test_replay_does_what_the_transform_does(name):
+    unit = ARM_UNITS[name]
+    strength = (0.9 if unit.name in STRONG else 0.3) * unit.high
+    log = recorded(arm(), (unit.effect, {unit.where: strength}))
+    # actions are single precision in the environment
+    assert worst(arm(), log, unit, strength) < 1e-5
+    assert worst(arm(), log) > 1e-4
+
+
+@pytest.mark.parametrize("name", ["coulomb_friction", "action_delay", "quadratic_drag"])
+def test_replay_does_what_the_transform_does_on_hopper(name):
+    task = known_task("Hopper-v5")
+    unit = deterministic(System(task=task).robot)[
+        f"{name}[{'actuator1' if 'action' in name else 'leg_joint'}]"
+    ]
+    start = torch.tensor([0.0, 1.25, 0.0, -0.1, -0.1, 0.1], dtype=torch.float64)
+    log = recorded(task, (unit.effect, {unit.where: 0.1 * unit.high}), start)
+    assert worst(task, log, unit, 0.1 * unit.high) < 1e-4
+
+
+def test_nothing_is_left_of_its_own_simulation():
+    assert worst(arm(), recorded(arm())) < 1e-5
+
+
+def test_candidates_do_not_touch_each_other():
+    task, log = arm(), recorded(arm())
+    prior = BoxPrior({"body_mass[lower]": (0.3, 0.8)})
+    system = System(task=task, prior=prior, physics=MujocoPhysics("body_mass[lower]"))
+    predictor = Predictor(system, threads=1)
+    segments = cut([log], 5)
+    friction, delay = effect("coulomb_friction"), effect("action_delay")
+    payload, drag = effect("payload"), effect("quadratic_drag")
+    theta = np.array([[0.5], [0.4], [0.5], [0.6], [0.5], [0.5]])
+    strengths = {
+        friction: np.array([[0, 0], [0.1, 0], [0, 0], [0, 0], [0, 0.1], [0, 0]]),
+        delay: np.array([[0, 0], [0, 0], [0.01, 0.01], [0, 0], [0, 0], [0, 0]]),
+        payload: np.array([[0, 0], [0, 0], [0, 0], [0.1, 0], [0, 0], [0, 0]]),
+        drag: np.array([[0, 0], [0, 0], [0.1, 0], [0, 0], [0, 0.1], [0, 0]]),
+    }
+    together = predictor.residuals(segments, theta, strengths)
+    for p in range(len(theta)):
+        alone = {e: s[p : p + 1] for e, s in strengths.items()}
+        one = predictor.residuals(segments, theta[p : p + 1], alone)
+        np.testing.assert_allclose(together[p], one[0], atol=1e-12)
+    np.testing.assert_allclose(together[0], together[-1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "strength", "see"),
+    [
+        ("sensor_bias", 0.1, lambda x, t: x + 0.1),
+        ("sensor_gain", 0.2, lambda x, t: 1.2 * x),
+        ("sensor_drift", 0.3, lambda x, t: x + 0.3 * t),
+    ],
+)
+def test_sensors_are_seen_through(name, strength, see):
+    task, true = arm(), recorded(arm())
+    qpos = true.qpos.clone()
+    qpos[:, 0] = see(qpos[:, 0], true.time)
+    fields = {n: getattr(true, n) for n in ("time", "qvel", "ctrl", "velocity_gain", "measured")}
+    log = Log(name="seen", qpos=qpos, **fields)
+    seen = effect(name)
+    system = System(task=task)
+    predictor = Predictor(system, threads=1)
+    strengths = {seen: strength * np.eye(1, len(system.robot.channels))}
+    residual = predictor.residuals(cut([log], 10, history=5), np.zeros((1, 0)), strengths)
+    assert np.abs(residual).max() < 1e-5
+    assert np.abs(predictor.residuals(cut([log], 10), np.zeros((1, 0)))).max() > 1e-2
+
+
+def test_a_diverging_candidate_is_nan_and_the_rest_unharmed():
+    system = System(task=arm())
+    predictor = Predictor(system, threads=1)
+    pushed = effect("constant_force")
+    strengths = {pushed: np.array([[0.0, 0.0], [1e12, 0.0]])}
+    residual = predictor.residuals(cut([recorded(arm())], 10), np.zeros((2, 0)), strengths)
+    assert np.isfinite(residual[0]).all()
+    assert np.isnan(residual[1]).any()

@@ -1,0 +1,105 @@
+"""Diagnose the sim-to-real gap: where it lies, which effect causes it, how far it shrinks."""
+
+from __future__ import annotations
+
+__all__ = ["diagnose"]
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ..effects.catalogue import CATALOGUE, effect
+from ..effects.effect import Effect
+from ..envs.task import Task
+from ..envs.tasks.catalogue import known_task
+from ..errors import message
+from ..inference.priors import BoxPrior
+from ..logs.log import Log
+from ..logs.sanity import Finding as SanityFinding
+from ..logs.system import System
+from ..physics.mujoco import MujocoPhysics
+from .evidence import assemble
+from .objective import units_of
+from .preparation import prepare
+from .report import Report
+from .selection import select
+
+_ALPHA = 0.01
+
+
+def diagnose(
+    simulator: str | Task | System,
+    prior: BoxPrior | None,
+    logs: Sequence[Log],
+    *,
+    effects: Sequence[str | Effect] | None = None,
+    findings: Sequence[SanityFinding] = (),
+    horizon: int | None = None,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Report:
+    """Say what the simulator lacks, or that it lacks nothing, or that the data cannot say.
+
+    Args:
+        simulator: A name such as ``Hopper-v5``, a `Task`, or a `System`.
+        prior: Over entries of the model, by their names, such as ``body_mass[torso]``; ``None``
+            where a system has its own, or nothing is uncertain.
+        logs: What the real robot did.
+        effects: Names from the catalogue, or effects of your own; default the system's, or all.
+        findings: Of the sanity gate, to be repeated in the report.
+        horizon: Control steps that are predicted at a time; default chosen from the data.
+        seed: Of the bootstrap and of the null distribution's draws.
+        progress: Told what is done.
+
+    Raises:
+        ValueError: There are no logs, or none is long enough.
+        KeyError: An effect is not in the catalogue.
+    """
+    begun = time.perf_counter()
+    system = _system(simulator, prior)
+    chosen = _effects(system, effects)
+    robot = system.robot
+    units = [u for u in units_of(chosen, robot) if not u.effect.random]
+    generator = np.random.default_rng(seed)
+    progress("fitting the parameters")
+    prepared = prepare(system, logs, units, generator=generator, horizon=horizon)
+    selection = select(
+        prepared.sets["train"],
+        prepared.sets["validation"],
+        prepared.nominal,
+        units,
+        alpha=_ALPHA,
+        generator=generator,
+        progress=progress,
+    )
+    progress("opening the test runs")
+    return assemble(
+        system,
+        logs,
+        prepared=prepared,
+        selection=selection,
+        findings=findings,
+        generator=generator,
+        begun=begun,
+        alpha=_ALPHA,
+    )
+
+
+def _system(simulator: str | Task | System, prior: BoxPrior | None) -> System:
+    if isinstance(simulator, System):
+        if prior is not None and simulator.prior is not None:
+            expected = "one prior"
+            raise ValueError(message(expected, "the system's and another", hint="pass None"))
+        if prior is None:
+            return simulator
+        simulator = simulator.task
+    task = known_task(simulator) if isinstance(simulator, str) else simulator
+    physics = None if prior is None else MujocoPhysics(*prior.names)
+    return System(task=task, physics=physics, prior=prior)
+
+
+def _effects(system: System, effects: Sequence[str | Effect] | None) -> list[Effect]:
+    if effects is None:
+        effects = list(CATALOGUE) if system.effects is None else system.effects
+    return [effect(e) if isinstance(e, str) else e for e in effects]

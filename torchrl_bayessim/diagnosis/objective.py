@@ -1,0 +1,154 @@
+"""How well parameters and effects explain segments: weighted innovations of many points at once.
+
+A *point* is a parameter vector in standardised units (the prior has mean 0 and standard deviation
+1) and strengths of some *units*, an effect at one of its targets each. Its cost is::
+
+    Σ_i w_i ‖L_i⁻¹ r_i(θ, s)‖² / φ + ‖z(θ)‖²,
+
+with the prior as regulariser: a posterior that was fitted to the same data without the effect has
+already absorbed it.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Objective", "Point", "Unit", "strengths_of", "units_of"]
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..effects.effect import Effect
+from ..effects.robot import Robot
+from ..inference.priors import Prior
+from .prediction import Predictor, Strengths
+from .segments import Segments
+from .whitening import Whitening
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One effect at one of its targets, or at all of them in a fixed proportion.
+
+    Attributes:
+        effect: The effect.
+        where: The target's name, or ``all``.
+        direction: Strength of each target per strength of the unit, shape ``(N,)``.
+        low: Lowest plausible strength, zero or negative.
+        high: Highest plausible strength.
+    """
+
+    effect: Effect
+    where: str
+    direction: tuple[float, ...]
+    low: float
+    high: float
+
+    @property
+    def name(self) -> str:
+        """The effect's name."""
+        return self.effect.name
+
+    def joint(self, robot: Robot) -> int:
+        """Return the joint at which it acts, -1 where there is none or there are several."""
+        targets = [i for i, part in enumerate(self.direction) if part]
+        return self.effect.joint(robot, targets[0]) if len(targets) == 1 else -1
+
+    def __str__(self) -> str:
+        return f"{self.effect.name}[{self.where}]"
+
+
+def units_of(effects: Sequence[Effect], robot: Robot) -> list[Unit]:
+    """Return every effect at every target that it has on this robot, and at all together.
+
+    At all together strengths are in proportion to their bounds.
+    """
+    units = []
+    for effect in effects:
+        names = effect.targets(robot)
+        if not names:
+            continue
+        low, high = (b.tolist() for b in effect.bounds(robot))
+        for i, name in enumerate(names):
+            if high[i] > 0:
+                one = tuple(float(i == j) for j in range(len(names)))
+                units.append(Unit(effect, name, one, low[i], high[i]))
+        if len(names) > 1 and max(high) > 0:
+            largest = max(range(len(names)), key=lambda i: high[i])
+            every = tuple(h / high[largest] for h in high)
+            units.append(Unit(effect, "all", every, low[largest], high[largest]))
+    return units
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A candidate explanation.
+
+    Attributes:
+        z: Standardised parameters, shape ``(D,)``.
+        strengths: Strengths of the units that are on.
+    """
+
+    z: Array
+    strengths: Mapping[Unit, float] = field(default_factory=dict)
+
+
+class Objective:
+    """Evaluates points on segments.
+
+    Args:
+        predictor: Simulates.
+        prior: Over the parameters; none if there are none.
+        segments: What to explain.
+        whitening: Turns residuals into innovations.
+    """
+
+    def __init__(
+        self, predictor: Predictor, prior: Prior | None, segments: Segments, whitening: Whitening
+    ) -> None:
+        self.predictor, self.prior = predictor, prior
+        self.segments, self.whitening = segments, whitening
+
+    @property
+    def size(self) -> int:
+        """The number of parameters ``D``."""
+        return 0 if self.prior is None else len(self.prior.names)
+
+    def thinned(self, every: int) -> Objective:
+        """Return the objective on every so many segments."""
+        index = np.arange(0, len(self.segments), every)
+        return Objective(
+            self.predictor, self.prior, self.segments.take(index), self.whitening.take(index)
+        )
+
+    def theta(self, z: Array) -> Array:
+        """Return parameters in their own units, shape ``(*, D)``."""
+        if self.prior is None:
+            return np.zeros((*z.shape[:-1], 0))
+        return self.prior.unstandardize(torch.from_numpy(z)).double().numpy()
+
+    def raw(self, points: Sequence[Point]) -> Array:
+        """Return residuals, shape ``(P, S, K, C)``."""
+        theta = self.theta(np.stack([point.z for point in points]))
+        strengths = strengths_of(points, self.predictor.system.robot)
+        return self.predictor.residuals(self.segments, theta, strengths)
+
+    def __call__(self, points: Sequence[Point]) -> Array:
+        """Return weighted innovations, shape ``(P, S, KC)``."""
+        return self.whitening(self.raw(points))
+
+
+def strengths_of(points: Sequence[Point], robot: Robot) -> Strengths:
+    """Return the strengths of points, by effect."""
+    result: dict[Effect, Array] = {}
+    for p, point in enumerate(points):
+        for unit, strength in point.strengths.items():
+            if unit.effect not in result:
+                count = len(unit.effect.targets(robot))
+                result[unit.effect] = np.zeros((len(points), count))
+            result[unit.effect][p] += strength * np.array(unit.direction)
+    return result

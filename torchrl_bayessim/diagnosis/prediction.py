@@ -1,0 +1,363 @@
+"""What a simulator with given parameters and effects would have measured, segment by segment.
+
+``P`` candidates (parameters and effect strengths) times ``S`` segments are ``P × S`` simulations of
+one batch: effects on commands and measurements act on the recorded sequences, effects on the model
+once per candidate, effects on forces at every time step. What is returned is the residual
+``y ⊖ ŷ``, in the tangent space, of the measured channels.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Predictor", "Strengths"]
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from torch import Tensor
+
+from ..effects.effect import (
+    ActionEffect,
+    Effect,
+    ForceEffect,
+    Memory,
+    ModelEffect,
+    SensorEffect,
+)
+from ..effects.fields import ModelFields
+from ..effects.forcing import Forcing
+from ..effects.sequence import command_sequence, measured_sequence, restored_sequence
+from ..envs.model_batch import ModelBatch
+from ..envs.stepper import Stepper
+from ..envs.task import Readings, Task
+from ..logs.system import System
+from .segments import Segments
+from .tangent import Tangent
+
+Array = NDArray[np.float64]
+Strengths = Mapping[Effect, Array]
+"""Strengths of the candidates, by effect: shape ``(P, N)`` for the effect's ``N`` targets."""
+
+_HELD = 0.010  # s that forces may be held while searching
+_ROWS = 30_000  # simulations per native call: bounds the memory, and costs nothing
+
+
+class _Batch:
+    """What physics needs of an environment: its models and their number."""
+
+    def __init__(self, models: ModelBatch) -> None:
+        self._models = models
+
+    @property
+    def models(self) -> ModelBatch:
+        return self._models
+
+    @property
+    def batch_size(self) -> torch.Size:
+        return torch.Size([self._models.num_envs])
+
+
+class Predictor:
+    """Simulates segments under many candidates.
+
+    Args:
+        system: The robot, its simulator and what was measured.
+        threads: Threads; default all cores that this process may use.
+
+    Attributes:
+        system: The robot.
+        tangent: The tangent space of its positions.
+        steps: Time steps simulated so far.
+        exact: Whether forces follow the state at every time step, as in an environment, and not
+            only every 10 ms, which is enough to tell effects apart.
+    """
+
+    def __init__(self, system: System, *, threads: int | None = None) -> None:
+        self.system = system
+        self.tangent = Tangent(system.task.model)
+        self.steps = 0
+        self.exact = False
+        task = system.task
+        self._models = ModelBatch(task.model, 1)
+        # from the beginning, since what one table overrides stays in a thread's model after it
+        self._entries = {
+            name: np.array([self._models.column(name, (d,)) for d in range(self.tangent.size)])
+            for name in ("dof_frictionloss", "dof_damping")
+        }
+        self._threads = threads
+        self._stepper = Stepper(task.model, 1, drive=task.drive, threads=threads)
+        self._forcing = Forcing(system.robot)
+        self._channels = np.array(system.channel_index, dtype=np.int64)
+
+    @cached_property
+    def finer(self) -> Predictor:
+        """The same with half the time step, to see what the time step does."""
+        task = self.system.task
+        model = copy.copy(task.model)
+        model.opt.timestep /= 2
+        halved = replace(task, model=model, frame_skip=2 * task.frame_skip)
+        other = Predictor(replace(self.system, task=halved), threads=self._threads)
+        other.exact = self.exact
+        return other
+
+    def residuals(
+        self,
+        segments: Segments,
+        theta: Array,
+        strengths: Strengths | None = None,
+        offsets: Array | None = None,
+    ) -> Array:
+        """Return measured minus simulated.
+
+        Args:
+            segments: What to replay.
+            theta: Parameters, shape ``(P, D)``.
+            strengths: Of the effects that are on somewhere.
+            offsets: Steps from the measured start states, in the tangent space, ``(P, 2 nv)``
+                or for each segment ``(P, S, 2 nv)``.
+
+        Returns:
+            Shape ``(P, S, K, C)``; NaN where a simulation diverged.
+        """
+        strengths = {} if strengths is None else strengths
+        chunk = max(1, _ROWS // len(segments))
+        parts = []
+        for begin in range(0, len(theta), chunk):
+            part = slice(begin, begin + chunk)
+            some = {e: s[part] for e, s in strengths.items() if s[part].any()}
+            steps = None if offsets is None else offsets[part]
+            parts.append(self._residuals(segments, theta[part], some, steps))
+        return np.concatenate(parts)
+
+    def _residuals(
+        self, segments: Segments, theta: Array, strengths: Strengths, offsets: Array | None
+    ) -> Array:
+        count, size, horizon = len(theta), len(segments), segments.horizon
+        restored = self._restored(segments, strengths, count)
+        commands, sequence = self._commands(segments, strengths, count)
+        self._write(theta, strengths)
+        stepper, at = self._stepper, segments.history
+        if stepper.num_envs != count * size:
+            stepper.resize(count * size)
+        stepper.use(self._models.repeated(size))
+        stepper.state[:] = stepper.initial
+        step = np.zeros((count, size, 2 * self.tangent.size))
+        step[..., self._channels] += restored[:, :, at] if restored is not None else 0.0
+        if offsets is not None:
+            step += offsets if offsets.ndim == 3 else offsets[:, None]
+        half = self.tangent.size
+        start = self.tangent.displace(segments.qpos[:, at], step[..., :half])
+        stepper["qpos"][:] = start.reshape(count * size, -1)
+        stepper["qvel"][:] = (segments.qvel[:, at] + step[..., half:]).reshape(count * size, -1)
+        stepper["time"][:] = np.tile(segments.time[:, at], count)[:, None]
+        simulated = np.full((count * size, horizon, stepper.output_size), np.nan)
+        hooked = np.zeros(count, dtype=bool)
+        for effect, values in strengths.items():
+            if isinstance(effect, ForceEffect):
+                hooked |= values.any(1)
+        rows = np.arange(count * size).reshape(count, size)
+        substeps = self.system.task.frame_skip
+        self.steps += count * size * horizon * substeps
+        free = rows[~hooked].reshape(-1)
+        if len(free):
+            stepper.rollout(
+                commands, substeps=substeps, sequence=sequence, rows=free, outputs=simulated
+            )
+        if hooked.any():
+            some = {e: s[hooked] for e, s in strengths.items() if isinstance(e, ForceEffect)}
+            pushed = rows[hooked].reshape(-1)
+            self._push(
+                segments,
+                some,
+                rows=pushed,
+                commands=commands[sequence[pushed]],
+                simulated=simulated,
+            )
+        simulated = simulated.reshape(count, size, horizon, -1)
+        return self._compare(segments, simulated, restored, strengths)
+
+    def _push(
+        self,
+        segments: Segments,
+        strengths: Mapping[ForceEffect, Array],
+        *,
+        rows: NDArray[np.int64],
+        commands: Array,
+        simulated: Array,
+    ) -> None:
+        """Simulate ``rows`` with forces of their own, one time step after the other."""
+        stepper, models = self._stepper, self._stepper.models
+        count = len(rows) // len(segments)
+        active = [
+            (e, torch.from_numpy(np.repeat(s, len(segments), axis=0))) for e, s in strengths.items()
+        ]
+        memories = self._warm(segments, active, count)
+        nominal = {name: models.table[rows][:, at] for name, at in self._entries.items()}
+        command = np.empty((stepper.num_envs, 1, commands.shape[2]))
+        alive = np.ones(len(rows), dtype=bool)
+        frame_skip = self.system.task.frame_skip
+        parts = frame_skip if self.exact else _parts(self.system.task)
+        held = self.system.task.dt / parts
+        for t in range(segments.horizon):
+            ctrl = torch.from_numpy(commands[:, t])
+            for _ in range(parts):
+                state = {n: torch.from_numpy(stepper[n][rows]) for n in ("qpos", "qvel", "time")}
+                added, memories = self._forcing(
+                    active, memories, Readings(**state, ctrl=ctrl), timestep=held
+                )
+                for name, at in self._entries.items():
+                    if name in added:
+                        models.table[np.ix_(rows, at)] = nominal[name] + added[name].numpy()
+                if "qfrc_applied" in added:
+                    stepper["qfrc_applied"][rows] = added["qfrc_applied"].numpy()
+                command[rows, 0] = ctrl + added["ctrl"] if "ctrl" in added else ctrl
+                now = rows[alive]
+                stepper.rollout(
+                    command, substeps=frame_skip // parts, rows=now, outputs=stepper.outputs
+                )
+                alive[alive] = stepper.status[now] == 0
+            simulated[rows[alive], t] = stepper.outputs[rows[alive], 0]
+
+    def _warm(
+        self, segments: Segments, active: Sequence[tuple[ForceEffect, Tensor]], count: int
+    ) -> list[Memory]:
+        """Run hidden states along the measured motion that leads to the start."""
+
+        def measured(k: int) -> Readings:
+            values = {"qpos": segments.qpos, "qvel": segments.qvel, "ctrl": segments.ctrl}
+            values["time"] = segments.time[..., None]
+            tiled = {n: np.tile(v[:, k], (count, 1)) for n, v in values.items()}
+            return Readings(**{n: torch.from_numpy(v) for n, v in tiled.items()})
+
+        memories = self._forcing.start(active, measured(0))
+        if any(memories):
+            for k in range(segments.history):
+                _, memories = self._forcing(
+                    active, memories, measured(k), timestep=self.system.task.dt
+                )
+        return memories
+
+    def _write(self, theta: Array, strengths: Strengths) -> None:
+        """Set the model entries of every candidate: parameters first, then effects on top."""
+        models = self._models
+        models.resize(len(theta))
+        everyone = torch.ones(len(theta), dtype=torch.bool)
+        if self.system.physics is not None:
+            models.restore()
+            batch: Any = _Batch(models)
+            values = torch.from_numpy(np.ascontiguousarray(theta))
+            empty = TensorDict(batch_size=batch.batch_size)
+            self.system.physics.write(batch, values, mask=everyone, tensordict=empty)
+        fields = ModelFields(models)
+        for effect, values in strengths.items():
+            if isinstance(effect, ModelEffect):
+                effect.write(fields, torch.from_numpy(values), self.system.robot)
+        fields.finish()
+
+    def _commands(
+        self, segments: Segments, strengths: Strengths, count: int
+    ) -> tuple[Array, NDArray[np.int64]]:
+        """Return the distinct command sequences, ``(B, H, A)``, and which each row follows."""
+        size, at = len(segments), segments.history
+        upto = at + segments.horizon
+        window = torch.from_numpy(segments.ctrl[:, :upto])
+        kinds = [(e, s) for e, s in strengths.items() if isinstance(e, ActionEffect)]
+        changed = np.zeros(count, dtype=bool)
+        for _, values in kinds:
+            changed |= values.any(1)
+        which = np.flatnonzero(changed)
+        plain = segments.ctrl[:, at:upto]
+        number = np.zeros(count, dtype=np.int64)
+        number[which] = 1 + np.arange(len(which))
+        sequence = (number[:, None] * size + np.arange(size)).reshape(-1)
+        if not len(which):
+            return np.ascontiguousarray(plain), sequence
+        time, robot = torch.from_numpy(segments.time[:, :upto]), self.system.robot
+        current = window.expand(len(which), *window.shape).clone()
+        for effect, values in kinds:
+            on = values[which].any(1)
+            if on.any():
+                strength = torch.from_numpy(values[which][on])[:, None]
+                current[torch.from_numpy(on)] = command_sequence(
+                    effect, current[torch.from_numpy(on)], strength, robot, time=time
+                )
+        distinct = np.concatenate([plain[None], current[:, :, at:].numpy()])
+        return np.ascontiguousarray(distinct.reshape(-1, *plain.shape[1:])), sequence
+
+    def _restored(self, segments: Segments, strengths: Strengths, count: int) -> Array | None:
+        """Return true minus measured channels over the windows, ``(P, S, W, C)``, or nothing."""
+        kinds = [(e, s) for e, s in strengths.items() if isinstance(e, SensorEffect)]
+        if not kinds:
+            return None
+        measured = torch.from_numpy(self.values(segments.qpos, segments.qvel))
+        true = measured.expand(count, *measured.shape).clone()
+        time, robot = torch.from_numpy(segments.time), self.system.robot
+        for effect, values in reversed(kinds):
+            on = torch.from_numpy(values.any(1))
+            if on.any():
+                strength = torch.from_numpy(values)[on][:, None]
+                true[on] = restored_sequence(effect, true[on], strength, robot, time=time)
+        return (true - measured).numpy()
+
+    def values(self, qpos: Array, qvel: Array) -> Array:
+        """Return what the channels of hinges and slides hold, zero for the others."""
+        values = np.zeros((*qpos.shape[:-1], len(self._channels)))
+        robot = self.system.robot
+        for c, (joint, kind) in enumerate(
+            zip(robot.channel_joint, robot.channel_kind, strict=True)
+        ):
+            if joint >= 0 and kind == "position":
+                values[..., c] = qpos[..., robot.qpos_index[joint]]
+            elif joint >= 0 and kind == "velocity":
+                values[..., c] = qvel[..., robot.dof_index[joint]]
+        return values
+
+    def _compare(
+        self, segments: Segments, simulated: Array, restored: Array | None, strengths: Strengths
+    ) -> Array:
+        """Return measured minus simulated, ``(P, S, K, C)``."""
+        nq = self.system.task.model.nq
+        rows, checked = segments.rows, segments.checked - 1
+        qpos, qvel = simulated[..., :nq], simulated[..., nq : nq + self.tangent.size]
+        with np.errstate(invalid="ignore"):
+            position = self.tangent.difference(qpos[:, :, checked], segments.qpos[:, rows])
+        velocity = segments.qvel[:, rows] - qvel[:, :, checked]
+        residual = np.concatenate([position, velocity], -1)[..., self._channels]
+        kinds = [(e, s) for e, s in strengths.items() if isinstance(e, SensorEffect)]
+        if restored is None or not kinds:
+            return residual
+        true = self.values(qpos, qvel)
+        before = self.values(segments.qpos, segments.qvel)[:, : segments.history + 1]
+        history = before + restored[:, :, : segments.history + 1]
+        wrong = self._seen(segments, history, true, kinds) - true
+        return residual - wrong[:, :, checked]
+
+    def _seen(
+        self,
+        segments: Segments,
+        history: Array,
+        true: Array,
+        kinds: Sequence[tuple[SensorEffect, Array]],
+    ) -> Array:
+        """Return what sensors show of simulated values, given the true ones before the start."""
+        record = torch.from_numpy(np.concatenate([history, true], axis=2))
+        time = torch.from_numpy(segments.time[:, : record.shape[2]])
+        robot = self.system.robot
+        for effect, values in kinds:
+            on = torch.from_numpy(values.any(1))
+            if on.any():
+                strength = torch.from_numpy(values)[on][:, None]
+                record[on] = measured_sequence(effect, record[on], strength, robot, time=time)
+        return record[:, :, segments.history + 1 :].numpy()
+
+
+def _parts(task: Task) -> int:
+    """Return into how many equal parts a control step is divided, each 10 ms at most."""
+    fewest = int(np.ceil(task.dt / _HELD - 1e-9))
+    return next(n for n in range(max(1, fewest), task.frame_skip + 1) if task.frame_skip % n == 0)

@@ -1,0 +1,271 @@
+"""From logs to a fitted nominal simulator: split, noise floor, horizon, segments, refit.
+
+The data are split by trajectory: fits and screening see the training logs, the choice of effects
+the validation logs too, and the test logs are opened once, for the figures that are reported.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Prepared", "prepare", "split"]
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..effects.catalogue import effect
+from ..errors import message
+from ..logs.log import Log
+from ..logs.system import System
+from .objective import Objective, Point, Unit, units_of
+from .prediction import Predictor
+from .refit import Fit, refit
+from .segments import Segments, cut
+from .whitening import Whitening, innovation_noise, noise_from_differences, whitening
+
+Array = NDArray[np.float64]
+_LADDER = (3, 10, 20, 40, 80, 160)
+_CHECKS = 10  # compared rows per segment
+_SKIP = 5  # control steps: the longest delay
+_HISTORY = 0.4  # seconds of commands that delay lines and filters look back at
+_ROWS = {"train": 900, "validation": 600, "test": 600}  # control steps simulated per candidate
+_PROBE = 160
+_WORTH = 0.2  # nats per effect that a longer horizon must bring
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What the search for effects starts from.
+
+    Attributes:
+        predictor: Simulates.
+        sets: Objectives by name of the split: ``train``, ``validation``, ``test``.
+        names: Names of the logs of each split.
+        noise: Standard deviation of each channel's noise.
+        noise_source: Where it comes from.
+        horizon: Control steps per segment.
+        nominal: The fit of the parameters alone.
+        alarms: What the reader must know.
+    """
+
+    predictor: Predictor
+    sets: Mapping[str, Objective]
+    names: Mapping[str, tuple[str, ...]]
+    noise: Array
+    noise_source: str
+    horizon: int
+    nominal: Fit
+    alarms: tuple[str, ...]
+
+
+def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
+    """Return training, validation and test logs.
+
+    From the longest to the shortest, of every four logs two train, one tests, one validates, so
+    that each split has some of the longest. Fewer than three logs are each divided in time: half, a
+    quarter, a quarter.
+    """
+    if len(logs) >= 3:
+        order = ("train", "test", "train", "validation")
+        parts: dict[str, list[Log]] = {"train": [], "validation": [], "test": []}
+        for i, log in enumerate(sorted(logs, key=len, reverse=True)):
+            parts[order[i % 4]].append(log)
+        if not parts["validation"]:
+            parts["validation"].append(parts["train"].pop())
+        return parts
+    parts = {"train": [], "validation": [], "test": []}
+    for log in logs:
+        length = len(log)
+        ends = 0, length // 2, 3 * length // 4, length
+        for name, begin, end in zip(parts, ends, ends[1:], strict=False):
+            parts[name].append(_rows(log, begin, end))
+    return parts
+
+
+def _rows(log: Log, begin: int, end: int) -> Log:
+    part = slice(begin, end)
+    arrays = {n: getattr(log, n)[part] for n in ("time", "qpos", "qvel", "ctrl")}
+    return replace(
+        log, name=f"{log.name} [{begin}:{end}]", first_row=log.first_row + begin, **arrays
+    )
+
+
+def prepare(
+    system: System,
+    logs: Sequence[Log],
+    units: Sequence[Unit],
+    *,
+    generator: np.random.Generator,
+    horizon: int | None = None,
+    predictor: Predictor | None = None,
+) -> Prepared:
+    """Split the logs, estimate the noise, choose the horizon, and fit the parameters.
+
+    Args:
+        system: The robot.
+        logs: Its logs.
+        units: The effects that will be looked for; the horizon is chosen so that they show.
+        generator: Of simulated noise, on which the whitening is checked.
+        horizon: Control steps per segment; default chosen.
+        predictor: Simulates; default a new one.
+
+    Raises:
+        ValueError: No log is long enough.
+    """
+    if not logs:
+        raise ValueError(message("logs", "none"))
+    predictor = Predictor(system) if predictor is None else predictor
+    alarms: list[str] = []
+    parts = split(logs)
+    if len(logs) < 3:
+        alarms.append(
+            f"{len(logs)} trajectories: training, validation and test are stretches of the same "
+            "runs, and intervals are too narrow"
+        )
+    history = min(max(8, round(_HISTORY / system.control_dt)), 100)
+    noise, source = _noise(system, predictor, parts["train"], history=history, alarms=alarms)
+    if horizon is None:
+        horizon = _horizon(
+            predictor, system, parts["train"], units=units, noise=noise, history=history
+        )
+    shortest = min(max(len(log) for log in part) for part in parts.values())
+    if horizon >= shortest:
+        horizon = max(1, shortest // 2)
+    pieces = {
+        name: cut(
+            part,
+            horizon,
+            history=history,
+            most=max(12, _ROWS[name] // horizon),
+            checks=_CHECKS,
+            burn_in=history,
+            skip=_SKIP,
+        )
+        for name, part in parts.items()
+    }
+    nominal, whitenings = _nominal(predictor, system, pieces, noise=noise, generator=generator)
+    sets = {n: Objective(predictor, system.prior, pieces[n], whitenings[n]) for n in pieces}
+    names = {n: tuple(log.name for log in part) for n, part in parts.items()}
+    return Prepared(predictor, sets, names, noise, source, horizon, nominal, tuple(alarms))
+
+
+def _start(system: System) -> Array:
+    return np.zeros(0 if system.prior is None else len(system.prior.names))
+
+
+def _theta(system: System, z: Array) -> Array:
+    if system.prior is None:
+        return np.zeros(0)
+    return system.prior.unstandardize(torch.from_numpy(z)).double().numpy()
+
+
+def _noise(
+    system: System,
+    predictor: Predictor,
+    logs: Sequence[Log],
+    *,
+    history: int,
+    alarms: list[str],
+) -> tuple[Array, str]:
+    """Return each channel's noise: the differences of innovations, checked by the sensor's spec."""
+    values = [predictor.values(log.qpos.numpy(), log.qvel.numpy()) for log in logs]
+    smooth = noise_from_differences(logs, values)
+    channels = system.robot.channels
+    given = np.array([system.noise.get(name, np.nan) for name in channels])
+    tiny = 1e-6 * system.robot.channel_scale.numpy()
+    noise = np.maximum(np.where(np.isnan(given), smooth, given), tiny)
+    steps = min(8, min(len(log) for log in logs) // 2)
+    pieces = cut(logs, steps, history=history, most=100, burn_in=history)
+    pushes = units_of([effect("constant_force")], system.robot)
+    pushes = [unit for unit in pushes if unit.where != "all"]
+    z = _start(system)
+    for _ in range(3):
+        white = whitening(predictor, pieces, _theta(system, z), noise)
+        objective = Objective(predictor, system.prior, pieces, white)
+        fit = refit(objective, [Point(z)], iterations=3)[0]
+        z = fit.point.z
+        points = [Point(z, {unit: 0.1 * unit.high}) for unit in pushes]
+        pushed = objective(points) if points else np.zeros((0, *fit.innovations.shape))
+        factor = innovation_noise(fit.innovations, pushed - fit.innovations, len(pieces.checked))
+        factor = np.clip(factor, 0.2, 5.0)
+        noise = np.maximum(noise * factor, tiny)
+    apart = [
+        f"{name}: {estimate:.3g} against {spec:.3g}"
+        for name, estimate, spec in zip(channels, noise, given, strict=True)
+        if spec > 0 and not 0.7 < estimate / spec < 1.4
+    ]
+    if apart:
+        alarms.append("noise floor uncertain, estimated against specified: " + ", ".join(apart))
+    return noise, "differences of innovations"
+
+
+def _horizon(
+    predictor: Predictor,
+    system: System,
+    logs: Sequence[Log],
+    *,
+    units: Sequence[Unit],
+    noise: Array,
+    history: int,
+) -> int:
+    """Return the horizon at which the effects would show most, per segment row simulated.
+
+    Chosen on what simulations of the effects would look like, never on the residuals: largest
+    ``Σ_e log(1 + λ_e)`` with ``λ_e`` the squared length of the whitened signature at a tenth of the
+    range, as long as second differences stay below first ones.
+    """
+    z = _start(system)
+    units = list({unit.name: unit for unit in units}.values())
+    typical = float(np.median([len(log) for log in logs]))
+    best, choice = -np.inf, _LADDER[0]
+    for steps in _LADDER:
+        if steps > typical / 5:
+            break
+        pieces = cut(
+            logs,
+            steps,
+            history=history,
+            most=max(4, _PROBE // steps),
+            checks=_CHECKS,
+            burn_in=history,
+            skip=_SKIP,
+        )
+        white = whitening(predictor, pieces, _theta(system, z), noise)
+        if white.curvature > 1.0 and np.isfinite(best):
+            break
+        objective = Objective(predictor, system.prior, pieces, white)
+        points = [Point(z), *(Point(z, {unit: 0.1 * unit.high}) for unit in units)]
+        innovations = objective(points)
+        change = ((innovations[1:] - innovations[0]) ** 2).sum((1, 2))
+        per_row = change * (sum(len(log) for log in logs) / (len(pieces) * steps))
+        value = float(np.log1p(per_row).sum())
+        if value > best + _WORTH * len(units):
+            best, choice = value, steps
+    return choice
+
+
+def _nominal(
+    predictor: Predictor,
+    system: System,
+    pieces: Mapping[str, Segments],
+    *,
+    noise: Array,
+    generator: np.random.Generator,
+) -> tuple[Fit, dict[str, Whitening]]:
+    """Fit the parameters, with the whitening and the robust weights that belong to the fit."""
+    z = _start(system)
+    white = whitening(predictor, pieces["train"], _theta(system, z), noise)
+    for _ in range(2):
+        objective = Objective(predictor, system.prior, pieces["train"], white)
+        plain = refit(objective, [Point(z)], iterations=6)[0]
+        z = plain.point.z
+        white = whitening(predictor, pieces["train"], _theta(system, z), noise)
+    whitenings = {}
+    for name, part in pieces.items():
+        bare = whitening(predictor, part, _theta(system, z), noise, generator=generator)
+        innovations = Objective(predictor, system.prior, part, bare)([Point(z)])[0]
+        whitenings[name] = bare.weighted(innovations)
+    objective = Objective(predictor, system.prior, pieces["train"], whitenings["train"])
+    return refit(objective, [Point(z)], iterations=4)[0], whitenings

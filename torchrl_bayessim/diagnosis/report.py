@@ -1,0 +1,222 @@
+"""What a diagnosis says: the verdict in one line, its evidence, and the simulator that follows.
+
+The JSON form is a stable interface, ``"schema": 1``.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Candidate", "Finding", "Gap", "Parameter", "Report"]
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from torchrl.envs import EnvBase, TransformedEnv
+
+from ..effects.effect import Effect
+from ..transforms.apply_effect import ApplyEffect
+
+Verdict = Literal["none", "named", "named_partial", "ambiguous", "unknown", "not_testable"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """An effect that the data need.
+
+    Attributes:
+        name: Its name in the catalogue.
+        where: Joint, actuator or channel, or ``all``.
+        strength: In ``unit``; where it sits at several targets, their mean.
+        unit: SI unit, or ``fraction``.
+        ci95: Interval of the strength.
+        p_value: Of the test that nothing was missing, when it was found.
+        share_of_gap: Share of the explainable error that it removes, over all orders of adding.
+        strengths: By target.
+    """
+
+    name: str
+    where: str
+    strength: float
+    unit: str
+    ci95: tuple[float, float]
+    p_value: float
+    share_of_gap: float
+    strengths: Mapping[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """What the data say about one effect at one place.
+
+    Attributes:
+        name: Its name.
+        where: Its target.
+        strength: The most likely one, alone.
+        ci95: Its interval where it was fitted, else ``None``.
+        likelihood_ratio: Of the screen at the nominal fit.
+        p_value: Of that ratio among all that were tried.
+        held_out_gain: Validation deviance that it removed alone; ``None`` where it was not fitted.
+        explained_fraction: Of the explainable error, alone.
+        explained_by_parameters: Share of its signature that parameters would swallow.
+        minimal_detectable_strength: What would have been seen with probability 0.8; ``None`` where
+            not even the largest plausible strength.
+        status: What became of it.
+    """
+
+    name: str
+    where: str
+    strength: float
+    ci95: tuple[float, float] | None
+    likelihood_ratio: float
+    p_value: float
+    held_out_gain: float | None
+    explained_fraction: float
+    explained_by_parameters: float
+    minimal_detectable_strength: float | None
+    status: Literal["named", "rejected", "ruled_out", "not_excited", "confounded"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """A parameter before and after.
+
+    Attributes:
+        name: Its name.
+        prior: Its bounds.
+        without_effects: Fitted alone.
+        with_effects: Fitted together with the effects.
+        sd: Standard deviation of the latter.
+        at_bound: Whether the fit alone left the bulk of the prior.
+    """
+
+    name: str
+    prior: tuple[float, float]
+    without_effects: float
+    with_effects: float
+    sd: float
+    at_bound: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gap:
+    """How large the error is, in mean squares of innovations: a perfect simulator has 1.
+
+    Attributes:
+        horizon_steps: Control steps predicted.
+        raw: At the prior's mean.
+        refit: With the parameters fitted.
+        with_effects: With the effects too.
+        floor: Of a perfect simulator.
+        explained_fraction: ``(refit - with_effects) / (refit - floor)`` on the test split.
+        ci95: Its interval, by bootstrap over trajectories.
+        by_parameters: ``(raw - refit) / (raw - floor)``.
+        rollout_rmse: Open-loop error over whole test runs, by channel, SI units.
+    """
+
+    horizon_steps: int
+    raw: float
+    refit: float
+    with_effects: float
+    floor: float
+    explained_fraction: float
+    ci95: tuple[float, float]
+    by_parameters: float
+    rollout_rmse: Mapping[str, Mapping[str, float]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Report:
+    """The outcome of a diagnosis; ``print(report)`` shows the one line.
+
+    Attributes:
+        verdict: ``none``: nothing is missing. ``named``: the effects explain the gap.
+            ``named_partial``: they explain most of it, and the rest is located. ``ambiguous``:
+            several effects explain it equally well. ``unknown``: the gap is real, and nothing in
+            the catalogue explains it. ``not_testable``: these data cannot say.
+        summary: One sentence.
+        effects: What was found, largest share first.
+        confusion_set: Effects that explain the data as well as the first, itself included.
+        where: Channel, outputs, joints, regimes and time of the error.
+        remainder: The same for what the effects leave.
+        gap: How large it is.
+        candidates: Every effect at every place.
+        parameters: The parameters.
+        alarms: What the reader must know before believing any of it.
+        next_experiment: What to record next.
+        audit: Split, simulations, noise floor, seconds.
+        strengths: The effects' strengths by target, as `apply` sets them.
+        figures: Numbers behind the pictures of the page.
+    """
+
+    verdict: Verdict
+    summary: str
+    effects: tuple[Finding, ...]
+    confusion_set: tuple[str, ...]
+    where: Mapping[str, Any]
+    remainder: Mapping[str, Any]
+    gap: Gap
+    candidates: tuple[Candidate, ...]
+    parameters: tuple[Parameter, ...]
+    alarms: tuple[str, ...]
+    next_experiment: tuple[Mapping[str, Any], ...]
+    audit: Mapping[str, Any]
+    strengths: Mapping[Effect, Mapping[str, float]] = field(default_factory=dict)
+    figures: Mapping[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return self.summary
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report as the JSON interface has it."""
+        gap = asdict(self.gap)
+        rollout = dict(gap.pop("rollout_rmse"))
+        return {
+            "schema": 1,
+            "verdict": self.verdict,
+            "summary": self.summary,
+            "effects": [asdict(effect) for effect in self.effects],
+            "confusion_set": list(self.confusion_set),
+            "where": self.where,
+            "remainder": self.remainder,
+            "gap": {
+                "metric": "mean squared innovation, 1 for a perfect simulator",
+                **gap,
+                "rollout_rmse": {**rollout, "unit": "SI, held-out, open loop"},
+            },
+            "candidates": [asdict(candidate) for candidate in self.candidates],
+            "parameters": [asdict(parameter) for parameter in self.parameters],
+            "alarms": list(self.alarms),
+            "next_experiment": [dict(step) for step in self.next_experiment],
+            "audit": dict(self.audit),
+        }
+
+    def to_json(self, path: str | Path) -> None:
+        """Write the report as JSON."""
+        text = json.dumps(_plain(self.to_dict()), indent=1, allow_nan=False)
+        Path(path).write_text(text, encoding="utf-8")
+
+    def apply(self, env: EnvBase) -> EnvBase:
+        """Return the environment with the effects that were found.
+
+        Args:
+            env: An environment of the simulator that was diagnosed.
+        """
+        for effect, strength in self.strengths.items():
+            env = TransformedEnv(env, ApplyEffect(effect, dict(strength)))
+        return env
+
+
+def _plain(value: Any) -> Any:
+    """Return the value with what JSON does not know (NaN, infinity, tuples) replaced."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(entry) for entry in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,44 @@
+"""Open-loop error over whole test runs, in the units of the measurements."""
+
+from __future__ import annotations
+
+__all__ = ["rollout_errors"]
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ..logs.log import Log
+from ..logs.system import System
+from .objective import Point, strengths_of
+from .preparation import Prepared, split
+from .segments import cut
+
+
+def rollout_errors(
+    prepared: Prepared, system: System, logs: Sequence[Log], points: Mapping[str, Point]
+) -> dict[str, dict[str, float]]:
+    """Return root mean square errors of each channel, by name of the point.
+
+    Every test run is simulated from its first measured state to its end. Where a simulation
+    diverges the error is infinite.
+    """
+    predictor, objective = prepared.predictor, prepared.sets["test"]
+    squares: dict[str, list[np.ndarray]] = {name: [] for name in points}
+    every = list(points.values())
+    theta = objective.theta(np.stack([point.z for point in every]))
+    strengths = strengths_of(every, predictor.system.robot)
+    history = objective.segments.history
+    for log in split(logs)["test"]:
+        if len(log) < 3:
+            continue
+        whole = cut([log], len(log) - 1, history=history)
+        residual = predictor.residuals(whole, theta, strengths)
+        for name, one in zip(points, residual, strict=True):
+            squares[name].append(one[0] ** 2)
+    result: dict[str, dict[str, float]] = {}
+    for name, parts in squares.items():
+        error = np.sqrt(np.concatenate(parts).mean(0)) if parts else np.full(1, np.nan)
+        error = np.nan_to_num(error, nan=np.inf)
+        result[name] = dict(zip(system.robot.channels, error.tolist(), strict=False))
+    return result

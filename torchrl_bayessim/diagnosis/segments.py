@@ -1,0 +1,151 @@
+"""Stretches of logs, each to be simulated from its measured start with its recorded actions.
+
+Multiple shooting: over a whole rollout a small error grows until it says nothing (chaos, contact),
+over a single step it drowns in the noise of the start state (Bock & Plitt 1984; Ribeiro et al.
+2020). So logs are cut into segments of ``horizon`` control steps. Each carries the rows before it,
+from which delay lines and filters know what came in.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Segments", "cut"]
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import message
+from ..logs.log import Log
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """``S`` segments of ``horizon`` control steps.
+
+    Windows hold ``history`` rows before the start, the start, ``horizon`` rows after it and
+    ``history`` more; beyond a log's ends its first and last row stand again.
+
+    Attributes:
+        horizon: Control steps.
+        history: Rows before the start, and after the end.
+        checked: After which of the ``horizon`` steps the simulation is compared, ``(K,)``, from 1.
+        log: Which log each is from, shape ``(S,)``.
+        start: The row at which each starts, shape ``(S,)``.
+        time: Seconds, windows, shape ``(S, W)``.
+        qpos: Positions, windows, shape ``(S, W, nq)``.
+        qvel: Velocities, windows, shape ``(S, W, nv)``.
+        ctrl: Commands, windows, shape ``(S, W, A)``.
+        velocity_gain: Noise of an estimated velocity per noise of the position, ``(nv,)``.
+    """
+
+    horizon: int
+    history: int
+    checked: NDArray[np.int64]
+    log: NDArray[np.int64]
+    start: NDArray[np.int64]
+    time: Array
+    qpos: Array
+    qvel: Array
+    ctrl: Array
+    velocity_gain: Array
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        """Where in a window the compared rows are, shape ``(K,)``."""
+        return self.history + self.checked
+
+    def take(self, index: NDArray[np.int64]) -> Segments:
+        """Return some of the segments."""
+        arrays = {
+            n: getattr(self, n)[index] for n in ("log", "start", "time", "qpos", "qvel", "ctrl")
+        }
+        return Segments(
+            self.horizon, self.history, self.checked, velocity_gain=self.velocity_gain, **arrays
+        )
+
+
+def cut(
+    logs: Sequence[Log],
+    horizon: int,
+    *,
+    history: int = 0,
+    most: int | None = None,
+    checks: int | None = None,
+    burn_in: int = 0,
+    skip: int = 0,
+) -> Segments:
+    """Cut logs into segments that follow one another.
+
+    Args:
+        logs: The logs.
+        horizon: Control steps per segment.
+        history: Rows that effects with a memory look back at.
+        most: At most so many segments, evenly taken from all.
+        checks: Compare after so many of the steps, evenly spaced and ending with the last;
+            default after each.
+        burn_in: Rows at the beginning of each log in which no segment starts, since nobody knows
+            what was commanded before; an eighth of the log at most.
+        skip: Compare nothing in the first rows, half of the horizon at most: a sensor that lags
+            shows there what was measured before the start, which is no prediction.
+
+    Raises:
+        ValueError: No log is longer than the horizon.
+
+    Example:
+        >>> import torch
+        >>> still = Log(
+        ...     name="still",
+        ...     time=torch.arange(21).double() / 100,
+        ...     qpos=torch.zeros(21, 1).double(),
+        ...     qvel=torch.zeros(21, 1).double(),
+        ...     ctrl=torch.zeros(21, 1).double(),
+        ...     velocity_gain=torch.zeros(1).double(),
+        ...     measured=torch.ones(2, dtype=torch.bool),
+        ... )
+        >>> cut([still], 5).start
+        array([ 0,  5, 10, 15])
+    """
+    found = [
+        (i, k)
+        for i, log in enumerate(logs)
+        for k in range(min(burn_in, len(log) // 8), len(log) - horizon, horizon)
+    ]
+    if not found:
+        longest = max((len(log) for log in logs), default=0)
+        expected = f"a log of more than {horizon} rows, one segment"
+        raise ValueError(message(expected, f"{longest} rows", hint="record longer"))
+    if most is not None and len(found) > most:
+        keep = np.linspace(0, len(found) - 1, most).round().astype(int)
+        found = [found[i] for i in keep]
+    step = 1 if checks is None else max(1, (horizon - skip) // checks)
+    checked = np.arange(horizon, min(skip, horizon // 2), -step)[::-1].astype(np.int64)
+    offsets = np.arange(-history, horizon + history + 1)
+
+    def windows(name: str) -> Array:
+        parts = []
+        for i, k in found:
+            values = getattr(logs[i], name).numpy()
+            parts.append(values[np.clip(k + offsets, 0, len(values) - 1)])
+        return np.stack(parts)
+
+    log, start = np.array(found, dtype=np.int64).T
+    gains = np.stack([one.velocity_gain.numpy() for one in logs])
+    return Segments(
+        horizon,
+        history,
+        checked,
+        log,
+        start,
+        windows("time"),
+        windows("qpos"),
+        windows("qvel"),
+        windows("ctrl"),
+        gains.max(0),
+    )

@@ -1,0 +1,181 @@
+"""The graded verdict, and one sentence that a roboticist can act on.
+
+A goodness-of-fit test always rejects in the end, so the verdict weighs how large the gap is and
+how much of it the effects explain, not only whether it is significant::
+
+    none           nothing significant, or an excess below 5 % of the noise floor
+    named          effects explain at least 80 %, and what is left is not significant
+    named_partial  effects explain at least half; the rest is located
+    ambiguous      effects of different kinds explain the data equally well
+    unknown        the gap is real, and the catalogue does not explain half of it
+    not_testable   the data are too few or too uniform to say
+"""
+
+from __future__ import annotations
+
+__all__ = ["conclude"]
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..logs.system import System
+from .preparation import Prepared
+from .report import Candidate, Finding, Verdict
+from .selection import Selection
+from .shrinkage import Shrinkage
+
+_NEGLIGIBLE = 0.05  # of the noise floor: an excess that no one would chase
+_UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
+_NAMED, _PARTIAL = 0.8, 0.5
+
+
+def conclude(
+    system: System,
+    prepared: Prepared,
+    *,
+    selection: Selection,
+    measured: Shrinkage,
+    effects: Sequence[Finding],
+    candidates: Sequence[Candidate],
+    confused: Sequence[str],
+    where: Mapping[str, Any],
+    alpha: float,
+) -> tuple[Verdict, str, list[str]]:
+    """Return the verdict, the sentence, and further alarms."""
+    alarms: list[str] = []
+    groups = {u.effect.group for u in selection.best.units if u.name in confused[:1]}
+    groups |= {u.effect.group for s in selection.screens[:1] for u in s.units if u.name in confused}
+    significant = selection.p_values[0] <= alpha
+    splits = [float((m**2).mean()) for m in
+              (selection.nominal.fit.innovations, selection.nominal.validation)]  # fmt: skip
+    visible = measured.excess_ci[0] > 0 and min(measured.refit, *splits) > _UNEXPLAINED
+    left = measured.remainder_ci[0] > _NEGLIGIBLE
+    verdict: Verdict
+    if not _excited(system, prepared):
+        verdict = "not_testable"
+        alarms.append("commands and motion hardly vary: no effect can be told from another")
+    elif not effects and not visible:
+        verdict = "none"
+    elif not effects:
+        verdict = "unknown"
+    elif measured.refit - 1.0 <= _NEGLIGIBLE and measured.excess_ci[0] <= 0:
+        # seen by the search, but too small to matter on the test runs
+        verdict = "none" if not significant else "named_partial"
+    elif measured.explained < _PARTIAL:
+        verdict = "unknown"
+    elif len(groups) > 1 and len(confused) > 1:
+        verdict = "ambiguous"
+    elif measured.explained >= _NAMED and not left:
+        verdict = "named"
+    else:
+        verdict = "named_partial"
+    if len(prepared.names["train"]) == 1 and verdict == "named" and prepared.alarms:
+        verdict = "named_partial"
+    return (
+        verdict,
+        _sentence(
+            verdict,
+            system,
+            prepared,
+            measured=measured,
+            effects=effects,
+            candidates=candidates,
+            confused=confused,
+            where=where,
+        ),
+        alarms,
+    )
+
+
+def _excited(system: System, prepared: Prepared) -> bool:
+    """Return whether the robot moved by more than its sensors' noise."""
+    segments = prepared.sets["train"].segments
+    moved = np.concatenate([segments.qpos, segments.qvel], -1)
+    spread = moved.reshape(-1, moved.shape[-1]).std(0)[list(system.channel_index)]
+    return bool((spread > 5.0 * prepared.noise).any())
+
+
+def _sentence(
+    verdict: Verdict,
+    system: System,
+    prepared: Prepared,
+    *,
+    measured: Shrinkage,
+    effects: Sequence[Finding],
+    candidates: Sequence[Candidate],
+    confused: Sequence[str],
+    where: Mapping[str, Any],
+) -> str:
+    gap = f"Gap: {measured.refit:.3g} times the noise floor on {prepared.horizon}-step prediction."
+    ruled_out = _ruled_out(candidates)
+    untested = _untested(candidates)
+    parameters = ""
+    if system.prior is not None and measured.raw > measured.refit:
+        share = (measured.raw - measured.refit) / max(measured.raw - 1.0, 1e-9)
+        parameters = f" Retuning parameters alone explains {_percent(share)}."
+    if verdict == "none":
+        return f"No gap above noise ({measured.refit:.2f} times the floor).{ruled_out}{untested}"
+    if verdict == "not_testable":
+        return f"These data cannot say: record motion that exceeds the noise.{untested}"
+    rules = where["regimes"]
+    place = f" It sits at {rules[0]['rule']}." if rules else ""
+    if verdict == "unknown":
+        best = max((c.explained_fraction for c in candidates), default=0.0)
+        best = max(best, measured.explained)
+        text = (
+            f"{gap} It is real, but no effect of the catalogue explains more than {_percent(best)}."
+        )
+        return f"{text}{place}{parameters}{untested}"
+    causes = ", and ".join(_described(e) for e in effects)
+    low, high = measured.explained_ci
+    share = f"explains {_percent(measured.explained)} [{100 * low:.0f}, {100 * high:.0f}] of it"
+    if verdict == "ambiguous":
+        others = ", ".join(confused)
+        return (
+            f"{gap} These data cannot tell the causes apart: {others}. The first, {causes}, "
+            f"{share}.{parameters}{untested}"
+        )
+    text = f"{gap} Cause: {causes}, {share}"
+    text += "." if verdict == "named" else f"; {_percent(1 - measured.explained)} remain."
+    if len(confused) > 1:
+        text += f" Not separable from: {', '.join(confused[1:])}."
+    return f"{text}{parameters}{untested}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * max(share, 0.0):.0f} %"
+
+
+def _described(effect: Finding) -> str:
+    half = (effect.ci95[1] - effect.ci95[0]) / 2
+    place = "at all" if effect.where == "all" else f"at {effect.where}"
+    name = effect.name.replace("_", " ")
+    return f"{name} {place} ({effect.strength:.3g} ± {half:.2g} {effect.unit})"
+
+
+def _ruled_out(candidates: Sequence[Candidate]) -> str:
+    """Return what would have been seen, for the effects that were not."""
+    found: dict[str, str] = {}
+    for c in candidates:
+        if c.status == "ruled_out" and c.minimal_detectable_strength is not None:
+            text = f"{c.name} above {c.minimal_detectable_strength:.2g} {_unit(c)}".rstrip()
+            found.setdefault(c.name, text)
+    some = list(found.values())[:4]
+    more = f" and {len(found) - 4} more" if len(found) > 4 else ""
+    return f" Ruled out: {', '.join(some)}{more}." if some else ""
+
+
+def _unit(candidate: Candidate) -> str:
+    return f"at {candidate.where}" if candidate.where != "all" else "anywhere"
+
+
+def _untested(candidates: Sequence[Candidate]) -> str:
+    by_name: dict[str, list[str]] = {}
+    for c in candidates:
+        by_name.setdefault(c.name, []).append(c.status)
+    names = [name for name, seen in by_name.items() if set(seen) == {"not_excited"}]
+    shown = ", ".join(name.replace("_", " ") for name in names[:5])
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return f" Could not be tested: {shown}{more}." if names else ""

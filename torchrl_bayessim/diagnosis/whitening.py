@@ -1,0 +1,182 @@
+"""Residuals in units of what noise alone would leave: covariance, robust weights, noise floor.
+
+The residual of segment ``i``, measured noise with covariance ``R`` at every compared row and a
+start state known only up to ``P0``, has covariance::
+
+    C_i = I ⊗ R + J_i P0 J_iᵀ + Σ_j κ_ij κ_ijᵀ + δ_i δ_iᵀ,    κ_ij = (ŷ⁺ + ŷ⁻ - 2ŷ) / 2,
+
+``J_i`` the derivative with respect to the start state by central differences of one standard
+deviation each. The second differences κ grow where contacts switch, and so tell the analysis not
+to trust exactly those segments. ``δ_i`` is what the time step does: twice the difference that half
+the time step makes, by Richardson's extrapolation of a method of first order, since a simulator
+that integrates coarsely is not a robot with another physics. With ``C_i = L_i L_iᵀ``, ``L_i⁻¹ r_i``
+are innovations: white, of unit variance, for a perfect simulator.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Whitening", "innovation_noise", "noise_from_differences", "whitening"]
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..logs.log import Log
+from .prediction import Predictor
+from .segments import Segments
+
+Array = NDArray[np.float64]
+_WORST = 1e3  # innovations beyond this, and those of diverged simulations, count as this
+_DRAWS = 8  # simulated robots that the whitening is checked on
+_THIRD_DIFFERENCE = 20.0  # 1 + 9 + 9 + 1: variance of y₃ - 3y₂ + 3y₁ - y₀ per unit of white noise
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """What turns residuals into innovations.
+
+    Attributes:
+        inverse: ``L⁻¹`` of each segment, shape ``(S, KC, KC)``.
+        weights: Square roots of the segments' robust weights, shape ``(S,)``.
+        spread: Standard deviations of the residuals under noise alone, ``(S, K, C)``.
+        curvature: Median over segments of ``‖κ‖ / ‖J‖``: above one the horizon is too long.
+    """
+
+    inverse: Array
+    weights: Array
+    spread: Array
+    curvature: float
+
+    def __call__(self, residual: Array) -> Array:
+        """Return weighted innovations, shape ``(P, S, KC)`` of residuals ``(P, S, K, C)``."""
+        flat = residual.reshape(*residual.shape[:2], -1)
+        white = np.matmul(self.inverse, flat.transpose(1, 2, 0)).transpose(2, 0, 1)
+        white = np.nan_to_num(white, nan=_WORST, posinf=_WORST, neginf=-_WORST)
+        return np.clip(white, -_WORST, _WORST) * self.weights[:, None]
+
+    def take(self, index: NDArray[np.int64]) -> Whitening:
+        """Return that of some of the segments."""
+        arrays = self.inverse[index], self.weights[index], self.spread[index]
+        return Whitening(*arrays, self.curvature)
+
+    def weighted(self, innovations: Array) -> Whitening:
+        """Return the same with Huber's weights for these innovations, ``(S, KC)``.
+
+        ``w_i = min(1, 1.5 m / r_i)`` with ``r_i`` the root mean square of segment ``i`` and ``m``
+        their median. They are computed once and kept for all candidates: weights of its own would
+        let a strong candidate remove what speaks against it.
+        """
+        size = np.sqrt((innovations**2).mean(-1))
+        weight = np.minimum(1.0, 1.5 * np.median(size) / np.maximum(size, 1e-12))
+        return Whitening(self.inverse, np.sqrt(weight), self.spread, self.curvature)
+
+
+def whitening(
+    predictor: Predictor,
+    segments: Segments,
+    theta: Array,
+    noise: Array,
+    *,
+    generator: np.random.Generator | None = None,
+) -> Whitening:
+    """Return the whitening at one candidate.
+
+    Args:
+        predictor: Simulates.
+        segments: The segments.
+        theta: Parameters, shape ``(D,)``.
+        noise: Standard deviation of each channel's noise, shape ``(C,)``.
+        generator: To check the whitening on simulated data: a perfect robot is simulated with half
+            the time step and noise of its own; segments whose innovations are larger than one there
+            (where the linear view of the start's noise fails) are trusted that much less.
+    """
+    start = _start_noise(predictor, segments, noise)
+    moved = np.flatnonzero(start)
+    offsets = np.zeros((1 + 2 * len(moved), len(start)))
+    for i, coordinate in enumerate(moved):
+        offsets[1 + 2 * i, coordinate] = start[coordinate]
+        offsets[2 + 2 * i, coordinate] = -start[coordinate]
+    thetas = np.repeat(theta[None], len(offsets), 0)
+    residual = predictor.residuals(segments, thetas, None, offsets)
+    finer = predictor.finer.residuals(segments, theta[None])
+    size, checks, channels = residual.shape[1:]
+    flat = np.nan_to_num(residual.reshape(len(offsets), size, -1))
+    plus, minus, nominal = flat[1::2], flat[2::2], flat[0]
+    slope, curve = (plus - minus) / 2, (plus + minus - 2 * nominal) / 2
+    spread = np.einsum("jsm,jsn->smn", slope, slope) + np.einsum("jsm,jsn->smn", curve, curve)
+    step = 2.0 * np.nan_to_num(finer.reshape(size, -1) - nominal)
+    spread += step[:, :, None] * step[:, None, :]
+    spread[:, np.arange(checks * channels), np.arange(checks * channels)] += np.tile(
+        noise**2, checks
+    )
+    lower = np.linalg.cholesky(spread)
+    inverse = np.linalg.inv(lower)
+    if generator is not None:
+        drawn = generator.standard_normal((_DRAWS, size, len(start))) * start
+        moved = predictor.residuals(segments, np.repeat(theta[None], _DRAWS, 0), None, drawn)
+        made = moved - finer + noise * generator.standard_normal(moved.shape)
+        white = np.matmul(inverse, np.nan_to_num(made, nan=_WORST).reshape(_DRAWS, size, -1, 1))
+        excess = np.minimum((white**2).mean((0, 2, 3)), _WORST)
+        inverse /= np.sqrt(np.maximum(excess, 1.0))[:, None, None]
+    variance = np.diagonal(spread, axis1=1, axis2=2).reshape(size, checks, channels)
+    bent = np.linalg.norm(curve, axis=(0, 2)) / np.maximum(
+        np.linalg.norm(slope, axis=(0, 2)), 1e-12
+    )
+    return Whitening(inverse, np.ones(size), np.sqrt(variance), float(np.median(bent)))
+
+
+def _start_noise(predictor: Predictor, segments: Segments, noise: Array) -> Array:
+    """Return how well each coordinate of the start state is known, shape ``(2 nv,)``."""
+    size = predictor.tangent.size
+    start = np.zeros(2 * size)
+    start[list(predictor.system.channel_index)] = noise
+    # An estimated velocity knows of the rows that it is to predict: three times its noise leaves
+    # the segment itself to say how fast it began.
+    estimated = 3.0 * segments.velocity_gain * start[:size]
+    start[size:] = np.maximum(start[size:], estimated)
+    return start
+
+
+def noise_from_differences(logs: Sequence[Log], values: Sequence[Array]) -> Array:
+    """Return each channel's noise from third differences, shape ``(C,)``.
+
+    A signal that is smooth on the scale of the sampling drops out of ``y₃ - 3y₂ + 3y₁ - y₀``; white
+    noise of variance σ² leaves 20 σ². The median is taken, since contacts are not smooth.
+
+    Args:
+        logs: The logs.
+        values: What their channels hold, shape ``(T, C)`` each.
+    """
+    third = [np.diff(v, 3, axis=0) for v, log in zip(values, logs, strict=True) if len(log) > 3]
+    spread = np.median(np.abs(np.concatenate(third)), axis=0) / 0.6745
+    return spread / np.sqrt(_THIRD_DIFFERENCE)
+
+
+def innovation_noise(innovations: Array, pushes: Array, checks: int) -> Array:
+    """Return by which factor each channel's noise differs from what was assumed, shape ``(C,)``.
+
+    ``σ̂² = mean ½(ε_{t+1} - ε_t)²`` over innovations in order of time, divided by what unit noise
+    gives in the same way: a model's error is smooth, and so drops out. What a constant force at any
+    joint could explain within the segment is projected out first, since over a few steps a missing
+    force is hardly more than that. The worst tenth of the segments is left out.
+
+    Args:
+        innovations: Shape ``(S, KC)``.
+        pushes: What a force at each joint changes, shape ``(J, S, KC)``.
+        checks: Rows per segment, ``K``.
+    """
+    size, channels = innovations.shape[1], innovations.shape[1] // checks
+    basis = np.moveaxis(pushes, 0, -1)
+    left, values, _ = np.linalg.svd(basis, full_matrices=False)
+    left = left * (values > 1e-6 * np.maximum(values[:, :1], 1e-12))[:, None]
+    steps = np.eye(size)[channels:] - np.eye(size)[:-channels]
+
+    def spread(some: Array) -> Array:
+        rest = some - np.einsum("smj,snj,sn->sm", left, left, some)
+        squares = ((rest @ steps.T) ** 2).reshape(len(some), checks - 1, channels).sum(1)
+        return np.where(squares <= np.quantile(squares, 0.9, axis=0), squares, 0.0).sum(0)
+
+    noise = np.random.default_rng(0).standard_normal((8, *innovations.shape))
+    return np.sqrt(spread(innovations) / np.mean([spread(one) for one in noise], axis=0))
