@@ -153,7 +153,12 @@ def sliding(state: Tensor, action: Tensor, next_state: Tensor, mask: Tensor) -> 
     lost = speed[..., :-1] - speed[..., 1:]
     apart = (next_state[..., 3:6] - next_state[..., :3]).norm(dim=-1)[..., :-1] > 0.06
     level = way[..., 1:, 2].abs() < 1e-3
-    free = mask[..., 1:] & apart & level & (lost > 2e-4) & (speed[..., 1:] > 1e-3)
+    slower = mask[..., 1:] & apart & level & (lost > 2e-4)
+    # a step in which it comes to rest loses less, and one in which it is still pushed anything
+    whole = speed[..., 1:] > 0.5 * lost
+    loose = slower & whole
+    strict = loose & torch.nn.functional.pad(slower[..., :-1], (1, 0))
+    free = torch.where(strict.any(-1, keepdim=True), strict, loose)
     quantiles = torch.where(free, lost, torch.nan).nanquantile(
         lost.new_tensor([0.1, 0.3, 0.5, 0.7, 0.9]), dim=-1
     )
