@@ -1,0 +1,104 @@
+"""What a simulator lacks, from logs of the real robot.
+
+    python recipes/diagnose.py system=robot.yaml data=logs/ out=report/
+
+Reads the description of the robot and its logs, checks whether the logs can be believed, and says
+where the gap lies, which effect causes it and how far it shrinks. Writes report.html (one file),
+report.json and result.json; the last line but one is the verdict in a sentence.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import recipe
+import torch
+from tqdm import tqdm
+
+from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.page import write_page
+from torchrl_bayessim.errors import message
+from torchrl_bayessim.logs.log import Log
+from torchrl_bayessim.logs.read import read_records
+from torchrl_bayessim.logs.sanity import Finding, check, usable_logs
+from torchrl_bayessim.logs.system import System
+
+STAGES = 6  # of a search that ends after one round
+SHORTEST = 10  # control steps that a log must have where no horizon is given
+
+
+@dataclass
+class Diagnosis(recipe.Settings):
+    """Settings; ``key=value`` on the command line overrides them."""
+
+    system: str = ""  # system.yaml
+    data: str = ""  # a folder of CSV or Parquet files, a Minari dataset, a saved TensorDict
+    effects: str = ""  # names with commas between them; the system's own by default
+    horizon: int = 0  # control steps predicted at a time; 0: chosen from the data
+    short: bool = False  # a smoke test: a diagnosis is one already
+
+
+def job(settings: Diagnosis, out: Path) -> dict[str, Any]:
+    """Read, check, diagnose, and write the report."""
+    torch.set_num_threads(1)  # simulations have threads of their own
+    system, logs, findings = read(settings)
+    with stages(shown=settings.progress) as progress:
+        report = diagnose(
+            system,
+            None,
+            logs,
+            effects=chosen(settings.effects),
+            findings=findings,
+            horizon=settings.horizon or None,
+            seed=settings.seed,
+            progress=progress,
+        )
+    report.to_json(out / "report.json")
+    write_page(report, out / "report.html")
+    print(f"The page is {out / 'report.html'}")
+    print(report.summary)
+    return json.loads((out / "report.json").read_text(encoding="utf-8"))
+
+
+def read(settings: Diagnosis) -> tuple[System, list[Log], list[Finding]]:
+    """Return the system, the logs that can be used, and what is odd about them."""
+    for name in ("system", "data"):
+        if not getattr(settings, name):
+            raise ValueError(message(f"{name}=PATH", "none"))
+    if settings.horizon < 0:
+        raise ValueError(message("a horizon of 1 or more, or 0 to choose one", settings.horizon))
+    system = System.load(settings.system)
+    records = read_records(settings.data, system)
+    findings = check(records, system, horizon=settings.horizon or SHORTEST)
+    for finding in findings:
+        print(finding)
+    return system, usable_logs(records, system, findings), findings
+
+
+def chosen(effects: str) -> list[str] | None:
+    """Return the names of the effects to consider, ``None`` for the system's own."""
+    return [name.strip() for name in effects.split(",")] if effects else None
+
+
+@contextmanager
+def stages(*, shown: bool) -> Iterator[Any]:
+    """Give what shows the stage that a diagnosis is at, in a bar."""
+    with tqdm(total=STAGES, disable=not shown, bar_format="{l_bar}{bar}| {elapsed}") as bar:
+
+        def begin(stage: str) -> None:
+            bar.total = max(bar.total, bar.n + 2)  # a further round of the search
+            bar.set_description(stage)
+            bar.update()
+
+        yield begin
+        bar.set_description("done")
+        bar.update(bar.total - bar.n)
+
+
+if __name__ == "__main__":
+    recipe.main(Diagnosis, job)
