@@ -377,7 +377,13 @@ def table(result: dict[str, Any], names: list[str]) -> str:
             cells = " | ".join(cell(row) for row in own)
             lines += [f"| {method} | {cells} | {'' if spent is None else f'{spent:.1f}'} |"]
         lines += ["", *(f"- {text}" for text in result["said"].get(name, [])), ""]
-    return "\n".join(lines)
+    lines += ["All parameters together, nats over the prior averaged over other truths:", ""]
+    lines += ["| problem | method | nats | fit [s] |", "|---|---|---|---|"]
+    lines += [
+        f"| {row['problem']} | {row['method']} | {row['nats']:.2f} | {row['seconds_fit']:.1f} |"
+        for row in result["joint"]
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def cell(row: dict[str, Any]) -> str:

@@ -152,8 +152,11 @@ def npe(
         joint = estimator.log_prob(truth[None], condition=summary)[0] - share.log()
         below = (inside.unsqueeze(-1) & (draws < truth)).sum(0)
         place = (below + 0.5) / (inside.sum(0).unsqueeze(-1) + 1)
-        within = torch.where(inside.unsqueeze(-1), draws, truth)  # the few outside do not count
-        marginal = from_draws(prior, truth, within).marginal
+        # the few draws outside the prior do not count: those inside take their places
+        first = inside.long().argsort(0, descending=True, stable=True)
+        turn = torch.arange(len(draws)).unsqueeze(-1) % inside.sum(0).clamp_min(1)
+        rows = first.gather(0, turn).unsqueeze(-1).expand_as(draws)
+        marginal = from_draws(prior, truth, draws.gather(0, rows)).marginal
         if len(prior.names) == 1:
             marginal = joint.unsqueeze(-1)
         return Answer(marginal, place, joint)
