@@ -153,7 +153,7 @@ def npe(
         below = (inside.unsqueeze(-1) & (draws < truth)).sum(0)
         place = (below + 0.5) / (inside.sum(0).unsqueeze(-1) + 1)
         # the few draws outside the prior do not count: those inside take their places
-        first = inside.long().argsort(0, descending=True, stable=True)
+        first = inside.long().argsort(dim=0, descending=True, stable=True)
         turn = torch.arange(len(draws)).unsqueeze(-1) % inside.sum(0).clamp_min(1)
         rows = first.gather(0, turn).unsqueeze(-1).expand_as(draws)
         marginal = from_draws(prior, truth, draws.gather(0, rows)).marginal
