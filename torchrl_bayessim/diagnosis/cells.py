@@ -19,7 +19,6 @@ from collections.abc import Mapping, Sequence
 
 from .drawing import number
 from .markup import Markup, element
-from .report import Finding
 
 
 def legend(entries: Mapping[str, str]) -> Markup:
@@ -31,9 +30,9 @@ def legend(entries: Mapping[str, str]) -> Markup:
     return element("p", *keys, class_="legend")
 
 
-def grid(charts: Sequence[Markup]) -> Markup:
+def grid(charts: Sequence[Markup], class_: str = "grid") -> Markup:
     """Return charts side by side, as many as there is room for."""
-    return element("div", *(element("figure", chart) for chart in charts), class_="grid")
+    return element("div", *(element("figure", chart) for chart in charts), class_=class_)
 
 
 def bar(share: float) -> Markup:
@@ -43,9 +42,9 @@ def bar(share: float) -> Markup:
     return element("span", fill, element("b", percent(share)), class_="share")
 
 
-def cell(value: float, share: float) -> Markup:
-    """Return a number on a ground whose depth is ``share``."""
-    return element("span", number(value), class_="heat", style=f"--share:{100 * share:.0f}%")
+def cell(text: str, share: float) -> Markup:
+    """Return text on a ground whose depth is ``share``."""
+    return element("span", text, class_="heat", style=f"--share:{100 * share:.0f}%")
 
 
 def strength(value: float, interval: Sequence[float] | None, unit: str) -> str:
@@ -56,7 +55,7 @@ def strength(value: float, interval: Sequence[float] | None, unit: str) -> str:
 
 def chance(p: float) -> str:
     """Return a p-value."""
-    return "below 1e-12" if p < 1e-12 else f"{p:.2g}"
+    return "< 1e-12" if p < 1e-12 else f"{p:.2g}"
 
 
 def percent(share: float) -> str:
@@ -74,7 +73,6 @@ def plain(name: str) -> str:
     return name.replace("_", " ")
 
 
-def words(effect: Finding) -> str:
+def words(name: str, where: str) -> str:
     """Return an effect and its place."""
-    place = "everywhere" if effect.where == "all" else f"at {effect.where}"
-    return f"{plain(effect.name)} {place}"
+    return f"{plain(name)} {'everywhere' if where == 'all' else f'at {where}'}"

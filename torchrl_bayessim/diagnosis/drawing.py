@@ -73,13 +73,17 @@ def waterfall(steps: Sequence[Step]) -> Markup:
     high = max([1e-12, *bounds])
     scale = (_WIDTH - 2 * _RIGHT - 62) / high
     parts = []
+
+    def place(value: float) -> float:
+        return _RIGHT + scale * min(max(value, 0.0), high)
+
     for i, step in enumerate(steps):
         y = _ROW * i
-        x0, x1 = (_RIGHT + scale * max(0.0, v) for v in sorted((step.begin, step.end)))
+        x0, x1 = sorted((place(step.begin), place(step.end)))
         total = step.begin == 0
         sign = "−" if step.end < step.begin else "+"
         shown = number(step.end) if total else f"{sign}{number(abs(_change(step)))}"
-        right = max([x1, *(_RIGHT + scale * v for v in (step.interval or ()))])
+        right = max([x1, *map(place, step.interval or ())])
         parts += [
             element("text", step.label, x=_RIGHT, y=y + 12),
             element("rect", x=_p(x0), y=y + 16, width=_p(max(x1 - x0, 1)), height=12,
@@ -87,7 +91,7 @@ def waterfall(steps: Sequence[Step]) -> Markup:
             element("text", shown, x=_p(right + 5), y=y + 26, class_="value"),
         ]  # fmt: skip
         if step.interval is not None:
-            low, top = (_RIGHT + scale * max(0.0, v) for v in step.interval)
+            low, top = map(place, step.interval)
             parts.append(element("path", d=_whisker(low, top, y + 22), class_="whisker"))
     told = "; ".join(f"{s.label}: {number(s.end if s.begin == 0 else _change(s))}" for s in steps)
     return _svg(parts, f"Mean squared innovation. {told}", height=_ROW * len(steps) + 4)
@@ -109,7 +113,8 @@ def curves(
     # a simulation that runs away must not flatten the rest
     reach = _span(known[first], 0.0)
     inside = [v for values in known.values() for v in values if abs(v - reach[0]) < 8 * reach[1]]
-    low, high = min([*inside, *known[first]]) - 2 * band, max([*inside, *known[first]]) + 2 * band
+    inside = [*inside, *known[first]] or [0.0]
+    low, high = min(inside) - 2 * band, max(inside) + 2 * band
     frame = _Frame((x[0], x[-1]), _room(low, high))
     parts = frame.axes(title, "time, s")
     if band:
@@ -119,7 +124,7 @@ def curves(
                  if b is not None]  # fmt: skip
         points = " ".join(f"{_p(a)},{_p(b)}" for a, b in [*upper, *reversed(lower)])
         parts.append(element("polygon", points=points, class_="band"))
-    for name, values in reversed(list(series.items())):
+    for name, values in series.items():
         parts += [element("path", d=d, class_=f"line {name}") for d in frame.paths(x, values)]
     return _svg(parts, f"{title} over {number(x[-1] - x[0])} s: {', '.join(series)}")
 
@@ -131,7 +136,7 @@ def means(series: Mapping[str, Mapping[str, Sequence[float]]], *, title: str, x:
           for f, e in zip(one["force"], one["error"], strict=True) for s in (-1, 1)]  # fmt: skip
     frame = _Frame(_room(min(xs), max(xs)), _room(min([0.0, *ys]), max([0.0, *ys])))
     parts = [*frame.axes(title, x), frame.level(0.0)]
-    for name, one in reversed(list(series.items())):
+    for name, one in series.items():
         parts += [element("path", d=d, class_=f"line {name}")
                   for d in frame.paths(one["x"], one["force"])]  # fmt: skip
         for a, b, e in zip(one["x"], one["force"], one["error"], strict=True):

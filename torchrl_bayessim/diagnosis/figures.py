@@ -26,12 +26,14 @@ from .screening import Screen
 from .segments import Segments
 from .selection import Selection
 from .shrinkage import Shrinkage
+from .whitening import whitening
 
 Array = NDArray[np.float64]
 _WORST = 3  # segments
 _PANELS = 4  # channels of a segment
 _LEADING = 12  # effects of the confusability matrix
 _BINS = 12
+_SHORT = 10  # control steps over which a force is nearly constant
 _QUARTERS = (0.25, 0.5, 0.75)
 
 
@@ -56,7 +58,7 @@ def figures(prepared: Prepared, selection: Selection, measured: Shrinkage) -> di
             "with_effects": [1.0 + bound for bound in measured.remainder_ci],
         },
         "segments": _segments(prepared, selection),
-        "signature": _signature(prepared.sets["train"], selection),
+        "signature": _signature(prepared, selection),
         "confusability": _confusability(seen),
         "heat": _heat(prepared.sets["validation"], selection.nominal.fit.point),
         "units": _units({*seen.units, *selection.best.units}, robot),
@@ -116,17 +118,27 @@ def _finite(values: Array) -> list[float | None]:
     return [value if np.isfinite(value) else None for value in values.tolist()]
 
 
-def _signature(train: Objective, selection: Selection) -> dict[str, Any]:
-    """Return the missing generalised force at the joint that matters most, before and after."""
-    robot = train.predictor.system.robot
+def _signature(prepared: Prepared, selection: Selection) -> dict[str, Any]:
+    """Return the missing generalised force at the joint that matters most, before and after.
+
+    A force is nearly constant over a few steps only, so training segments are cut into short ones.
+    """
+    train, robot = prepared.sets["train"], prepared.predictor.system.robot
+    before_fit, after_fit = selection.nominal.fit, selection.best.fit
+    short = _shortened(train.segments)
+    theta = train.theta(before_fit.point.z)
+    white = whitening(prepared.predictor, short, theta, prepared.noise)
+    train = Objective(prepared.predictor, train.prior, short, white)
+    one, two = train([before_fit.point, after_fit.point])
     pushes = [u for u in units_of([effect("constant_force")], robot) if u.where in robot.joints]
-    before = signature_curves(train, selection.nominal.fit, pushes)
+    before = signature_curves(train, replace(before_fit, innovations=one), pushes)
     if not before:
         return {}
     joint = _joint(selection.best.units, robot) or max(before, key=lambda j: _variance(before[j]))
     curves = {"before": before[joint]}
     if selection.best.units:
-        curves["after"] = signature_curves(train, selection.best.fit, pushes)[joint]
+        fit = replace(after_fit, innovations=two)
+        curves["after"] = signature_curves(train, fit, pushes)[joint]
     push = next(unit for unit in pushes if unit.where == joint)
     return {
         "joint": joint,
@@ -139,6 +151,25 @@ def _signature(train: Objective, selection: Selection) -> dict[str, Any]:
             for name in before[joint]
         },
     }
+
+
+def _shortened(segments: Segments) -> Segments:
+    """Return the same stretches in shorter segments."""
+    horizon = min(_SHORT, segments.horizon)
+    offsets = range(0, segments.horizon - horizon + 1, horizon)
+    width = 2 * segments.history + horizon + 1
+    windows = {
+        name: np.concatenate([getattr(segments, name)[:, o : o + width] for o in offsets])
+        for name in ("time", "qpos", "qvel", "ctrl")
+    }
+    return replace(
+        segments,
+        horizon=horizon,
+        checked=np.arange(1, horizon + 1, dtype=np.int64),
+        log=np.tile(segments.log, len(offsets)),
+        start=np.concatenate([segments.start + o for o in offsets]),
+        **windows,
+    )
 
 
 def _joint(units: Sequence[Unit], robot: Robot) -> str:
@@ -168,7 +199,7 @@ def _confusability(seen: Screen) -> dict[str, Any]:
             best.setdefault(seen.units[i].name, i)
     rows = list(best.values())[:_LEADING]
     return {
-        "names": [str(seen.units[i]) for i in rows],
+        "effects": [[seen.units[i].name, seen.units[i].where] for i in rows],
         "matrix": np.abs(seen.correlation[np.ix_(rows, rows)]).clip(0, 1).tolist(),
     }
 

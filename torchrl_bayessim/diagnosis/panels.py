@@ -45,7 +45,7 @@ def size(report: Report) -> Markup:
     for effect in report.effects:
         share = effect.share_of_gap / whole if whole > 0 else 1 / len(report.effects)
         lower = level - share * (gap.refit - gap.with_effects)
-        steps.append(Step(f"credit to {words(effect)}", level, lower, "effect"))
+        steps.append(Step(f"credit to {words(effect.name, effect.where)}", level, lower, "effect"))
         level = lower
     if report.effects:
         interval = intervals.get("with_effects")
@@ -61,7 +61,9 @@ def size(report: Report) -> Markup:
             f" The effects explain {percent(gap.explained_fraction)} of what fitting leaves above "
             f"the floor, interval {percent(low)} to {percent(high)}."
         )
-    return joined([element("p", told), grid([waterfall(steps)]), _rollouts(gap.rollout_rmse)])
+    return joined(
+        [element("p", told), grid([waterfall(steps)], "grid wide"), _rollouts(gap.rollout_rmse)]
+    )
 
 
 def _rollouts(errors: Mapping[str, Mapping[str, float]]) -> Markup | None:
@@ -102,7 +104,7 @@ def _shares_of(where: Mapping[str, Any], title: str) -> Markup:
     tables = [
         table(f"Share by {name}", [name, "share"],
               [[e["name"], bar(e["share"])] for e in entries], shown=8)
-        for name, entries in groups.items() if entries
+        for name, entries in groups.items() if any(e["share"] > 0 for e in entries)
     ]  # fmt: skip
     rules = [
         element("li", element("code", r["rule"]),
@@ -110,7 +112,7 @@ def _shares_of(where: Mapping[str, Any], title: str) -> Markup:
         for r in where.get("regimes", ())
     ]  # fmt: skip
     told = element("ul", *rules) if rules else element("p", "No regime stands out.")
-    return joined([element("h3", title), told, grid(tables)])
+    return joined([element("h3", title), told, grid(tables, "grid small")])
 
 
 def _heat(heat: Mapping[str, Any]) -> Markup | None:
@@ -123,7 +125,7 @@ def _heat(heat: Mapping[str, Any]) -> Markup | None:
     ]  # fmt: skip
     top = max([1e-12, *(v for row in heat["excess"] for v in row)])
     rows = [
-        [name, *(cell(v, v / top) for v in row)]
+        [name, *(cell(number(v), v / top) for v in row)]
         for name, row in zip(heat["outputs"], heat["excess"], strict=True)
     ]
     caption = f"Excess squared error over noise, by output and {heat['feature']}, in quarters"
@@ -138,7 +140,7 @@ def evidence(report: Report) -> Markup:
     rows = [_row(c, units.get(f"{c.name}[{c.where}]", "")) for c in some]
     head = ["effect", "where", "status", "strength alone", "p", "held-out gain",
             "explains alone", "swallowed by parameters", "would have been seen from"]  # fmt: skip
-    told = [element("p", _told(effect)) for effect in report.effects]
+    told = [element("p", _told(effect, units)) for effect in report.effects]
     if len(report.confusion_set) > 1:
         names = ", ".join(plain(name) for name in report.confusion_set)
         told.append(element("p", f"These data cannot tell apart: {names}."))
@@ -162,13 +164,14 @@ def _row(c: Candidate, unit: str) -> list[object]:
     ]  # fmt: skip
 
 
-def _told(effect: Finding) -> str:
+def _told(effect: Finding, units: Mapping[str, str]) -> str:
     by_target = ", ".join(f"{name} {number(s)}" for name, s in effect.strengths.items())
     several = f" ({by_target})" if len(effect.strengths) > 1 else ""
-    amount = strength(effect.strength, effect.ci95, effect.unit)
+    unit = units.get(f"{effect.name}[{effect.where}]", effect.unit)
+    amount = strength(effect.strength, effect.ci95, unit)
     return (
-        f"Found: {words(effect)}, {amount}{several}; p = {chance(effect.p_value)}; "
-        f"{percent(effect.share_of_gap)} of the gap."
+        f"Found: {words(effect.name, effect.where)}, {amount}{several}; "
+        f"p-value {chance(effect.p_value)}; {percent(effect.share_of_gap)} of the gap."
     )
 
 
@@ -204,11 +207,13 @@ def signature(figures: Mapping[str, Any]) -> Markup:
         return element("p", "No joint of this robot can be pushed.")
     title = f"force at {seen['joint']}, {seen['unit']}"
     names = {"before": "without", "after": "with"}
+    length = "m" if seen["unit"] == "N" else "rad"
+    units = {"velocity": f", {length}/s", "position": f", {length}", "time": ", s"}
     charts, shown = [], ["without"]
     for against, by_time in seen["curves"].items():
         series = {names[when]: binned for when, binned in by_time.items()}
         shown = list(series)
-        charts.append(means(series, title=title, x=against))
+        charts.append(means(series, title=title, x=f"{against}{units.get(against, '')}"))
     told = (
         "The constant force that would mend each training segment best, in bins of equally many "
         "segments with two standard errors. A step at zero velocity is dry friction, a slope "
@@ -220,13 +225,13 @@ def signature(figures: Mapping[str, Any]) -> Markup:
 
 def confusability(figures: Mapping[str, Any]) -> Markup:
     """Return how alike the leading effects' signatures are."""
-    names = figures.get("confusability", {}).get("names", ())
-    if not names:
+    effects = figures.get("confusability", {}).get("effects", ())
+    if not effects:
         return element("p", "No effect left a trace in these data.")
-    numbers = [str(i + 1) for i in range(len(names))]
+    numbers = [str(i + 1) for i in range(len(effects))]
     rows = [
-        [f"{n} {name.replace('_', ' ')}", *(cell(v, v**2) for v in row)]
-        for n, name, row in zip(numbers, names, figures["confusability"]["matrix"], strict=True)
+        [f"{n} {words(*one)}", *(cell(f"{v:.2f}", v**2) for v in row)]
+        for n, one, row in zip(numbers, effects, figures["confusability"]["matrix"], strict=True)
     ]
     told = (
         "Cosines between what the leading effects would change, after the parameters took their "
@@ -279,7 +284,9 @@ def next_experiment(report: Report) -> Markup:
 
 def audit(done: Mapping[str, Any]) -> Markup:
     """Return what was done to find all this."""
-    rows = [[name.replace("_", " "), _entry(value)] for name, value in done.items()]
+    rows = [
+        [plain(name), element("span", _entry(value), class_="long")] for name, value in done.items()
+    ]
     return table("Audit", ["what", "value"], rows, shown=40)
 
 

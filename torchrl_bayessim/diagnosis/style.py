@@ -36,6 +36,9 @@ header.ambiguous, header.unknown { border-color: var(--without); }
 summary { cursor: pointer; padding: .3rem 0; }
 .grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 20rem), 1fr));
   gap: .8rem 1.2rem; align-items: start; }
+.grid.small { grid-template-columns: repeat(auto-fill, minmax(min(100%, 14rem), 1fr)); }
+.grid.wide { grid-template-columns: minmax(0, 32rem); }
+.grid.wide figure { max-width: none; }
 figure { margin: 0; min-width: 0; max-width: 30rem; }
 svg { display: block; width: 100%; height: auto; font-size: 11.5px; fill: var(--ink); }
 td svg { width: 9.5rem; }
@@ -44,10 +47,9 @@ svg .end { text-anchor: end; fill: var(--soft); }
 svg .middle { text-anchor: middle; fill: var(--soft); }
 .grid path, .line { fill: none; }
 .line { stroke-width: 1.8; stroke-linejoin: round; }
-.line.real { stroke: var(--real); }
+.line.real { stroke: var(--real); stroke-width: 4.5; stroke-opacity: .3; }
 .line.without { stroke: var(--without); stroke-dasharray: 5 3; }
-.line.with { stroke: var(--with); stroke-dasharray: 1.5 2.5; stroke-linecap: round;
-  stroke-width: 2.4; }
+.line.with { stroke: var(--with); stroke-dasharray: 2 2.5; stroke-width: 2.2; }
 svg path.grid { stroke: var(--line); }
 svg path.zero { stroke: var(--soft); }
 .whisker { stroke: var(--ink); stroke-width: 1.2; fill: none; }
@@ -61,7 +63,8 @@ svg .band { fill: var(--soft); fill-opacity: .22; }
 .legend { display: flex; flex-wrap: wrap; gap: .2rem 1.2rem; margin: .3rem 0; font-size: .9rem; }
 .key { display: inline-block; width: 1.6rem; margin-right: .4rem; vertical-align: .25em;
   border-top: 3px solid; }
-.key.real { color: var(--real); }
+.key.real { color: color-mix(in srgb, var(--real) 35%, transparent);
+  border-top-width: 5px; }
 .key.without { color: var(--without); border-top-style: dashed; }
 .key.with { color: var(--with); border-top-style: dotted; }
 .scroll { overflow-x: auto; margin: .5rem 0; }
@@ -69,6 +72,9 @@ table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabu
 caption { text-align: left; color: var(--soft); padding: .2rem 0; }
 th, td { text-align: left; padding: .25rem .8rem .25rem 0; border-bottom: 1px solid var(--line);
   vertical-align: middle; font-weight: 400; }
+td { white-space: nowrap; }
+.long { white-space: normal; display: inline-block; max-width: min(50rem, 62vw);
+  overflow-wrap: anywhere; }
 thead th { color: var(--soft); vertical-align: bottom; }
 tbody th { overflow-wrap: anywhere; min-width: 6rem; }
 .grid table { width: 100%; }
