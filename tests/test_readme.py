@@ -12,13 +12,15 @@ def blocks(language):
     return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
 
 
-def test_python_blocks_run_in_order(capsys):
+def test_python_blocks_run_in_order(capsys, monkeypatch):
+    monkeypatch.chdir(ROOT)
     namespace = {}
     for source in blocks("python"):
         exec(compile(source, "README.md", "exec"), namespace)
     printed = capsys.readouterr().out
     assert "tensor([" in printed
     assert namespace["rollout"]["theta"].shape == (2, 10, 2)
+    assert namespace["report"].effects[0].name == "coulomb_friction"
 
 
 def test_shell_blocks_are_what_ci_runs():

@@ -7,6 +7,7 @@ The public names; everything else is in the module of its concept, e.g.
 from __future__ import annotations
 
 __all__ = [
+    "ApplyEffect",
     "ApplyPhysics",
     "AttributePhysics",
     "BatchedMujocoEnv",
@@ -20,17 +21,23 @@ __all__ = [
     "PosteriorRefinement",
     "RecordedLogs",
     "Replay",
+    "Report",
     "SimToRealLoop",
     "StatePhysics",
     "SummaryStatistics",
     "SurrogateRobot",
+    "System",
+    "diagnose",
     "fit",
+    "read_logs",
     "sequential",
     "simulate",
 ]
 
 from importlib.metadata import version
 
+from .diagnosis.diagnose import diagnose
+from .diagnosis.report import Report
 from .envs.mujoco import BatchedMujocoEnv
 from .inference.fit import fit
 from .inference.losses import PosteriorLoss
@@ -38,6 +45,8 @@ from .inference.posterior import MixtureDensityPosterior
 from .inference.priors import BoxPrior, GaussianPrior
 from .inference.refinement import PosteriorRefinement
 from .inference.sequential import sequential
+from .logs.read import read_logs
+from .logs.system import System
 from .loop import SimToRealLoop
 from .physics.attributes import AttributePhysics
 from .physics.mujoco import MujocoPhysics
@@ -47,6 +56,6 @@ from .replay import Replay
 from .robots import RecordedLogs, SurrogateRobot
 from .simulate import simulate
 from .summaries import SummaryStatistics
-from .transforms import ApplyPhysics, DomainRandomizer
+from .transforms import ApplyEffect, ApplyPhysics, DomainRandomizer
 
 __version__ = version("torchrl_bayessim")
