@@ -1,0 +1,1 @@
+"""Blind check of the gap diagnosis: a generator of its own, sealed labels, and scores."""

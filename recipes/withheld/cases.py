@@ -1,0 +1,207 @@
+"""Cases of the blind check: what is drawn, what the diagnosis is given, what is sealed."""
+
+from __future__ import annotations
+
+__all__ = ["Case", "Plan", "make", "sites"]
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from .causes_actuation import ACTUATION
+from .causes_body import BODY, CONTACT
+from .causes_foreign import FOREIGN
+from .causes_sensing import SENSING
+from .classes import without_class_of
+from .detectability import detectability
+from .excitation import KINDS, open_loop, proportional
+from .laws import Made, Site
+from .plant import Motion, Plant, Policy, Truth
+from .robots import ROBOTS, Robot, nominal_model, write_entry
+
+Array = NDArray[np.float64]
+CAUSES = ACTUATION | BODY | CONTACT | SENSING | FOREIGN
+# What no data can tell from a parameter: the prior then is over the others.
+_LIKE_MASSES = {"action_gain", "payload", "armature", "com_shift", "link_length"}
+_LIKE_DAMPINGS = {"viscous_friction"}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What kind of case to draw.
+
+    Attributes:
+        tier: ``T0`` to ``T6`` or a control's name.
+        robot: Its name.
+        causes: Names of the causes.
+        form: ``same`` as the catalogue's, or ``other``.
+        engine: ``fine`` or ``other``: another integrator, cone and solver.
+        control: ``noise``, ``shuffled`` or nothing.
+    """
+
+    tier: str
+    robot: str
+    causes: tuple[str, ...] = ()
+    form: str = "same"
+    engine: str = "fine"
+    control: str = ""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A robot's logs and what is true of them.
+
+    Attributes:
+        plan: What was asked for.
+        truths: Of the causes.
+        theta: True parameters, by entry of the model.
+        priors: Bounds of those that the diagnosis may refit.
+        motions: Logs.
+        unseen: Noise-free motions of the same robot with new inputs.
+        noise: Standard deviations told by the data sheet, ``(2 nv,)``, or nothing.
+        velocities: Whether velocities are logged.
+        effects: Names that the diagnosis may consider; nothing for all.
+        detectability: See `detectability`.
+        excitation: How it was moved.
+    """
+
+    plan: Plan
+    truths: tuple[Truth, ...]
+    theta: dict[str, float]
+    priors: dict[str, tuple[float, float]]
+    motions: tuple[Motion, ...]
+    unseen: tuple[Motion, ...]
+    noise: Array | None
+    velocities: bool
+    effects: tuple[str, ...] | None
+    detectability: float
+    excitation: str
+
+
+def make(plan: Plan, rng: np.random.Generator) -> Case:
+    """Return a case; one whose simulation diverges is drawn again."""
+    for _ in range(20):
+        try:
+            return _make(plan, rng)
+        except FloatingPointError:
+            continue
+    raise ValueError(f"expected a case that can be simulated, got {plan} diverging 20 times")
+
+
+def _make(plan: Plan, rng: np.random.Generator) -> Case:
+    robot = ROBOTS[plan.robot]
+    nominal = nominal_model(robot)
+    priors = _priors(robot, plan.causes, rng)
+    theta = {}
+    for entry, (low, high) in priors.items():
+        share = rng.uniform(0.1, 0.9) if plan.control != "parameters" else rng.choice([0.03, 0.97])
+        theta[entry] = low + (high - low) * float(share)
+        write_entry(nominal, entry, theta[entry])
+    made = [_cause(name, plan.form, model=nominal, robot=robot, rng=rng) for name in plan.causes]
+    nv = nominal.nv
+    noise = np.repeat([_log(rng, 1e-3, 3e-3), _log(rng, 1e-2, 3e-2)], nv)
+    plant = Plant(
+        _true_model(nominal, robot, plan.engine), robot.control_dt, [c for c, _ in made], noise, rng
+    )
+    loops = str(rng.choice(["open", "open", "closed", "mixed"]))
+    velocities = bool(rng.random() < 0.75)
+    told = noise if rng.random() < 0.5 else None
+    if plan.control == "noise":
+        told, plant.noise = noise, 2.0 * noise
+    count, steps = int(rng.integers(6, 13)), int(rng.integers(*robot.steps, endpoint=True))
+    motions = _motions(plant, robot, loops, count=count, steps=steps, rng=rng)
+    real, plant.noise = plant.noise, 0.0 * noise
+    unseen = _motions(plant, robot, loops, count=3, steps=steps, rng=rng)
+    measured = np.repeat([True, velocities], nv)
+    visible = detectability(
+        nominal, motions, substeps=round(robot.control_dt / nominal.opt.timestep),
+        noise=real, measured=measured, parameters=list(priors),
+    )  # fmt: skip
+    if plan.control == "shuffled":
+        motions = [replace(m, ctrl=motions[i - 1].ctrl) for i, m in enumerate(motions)]
+    withheld = tuple(without_class_of(plan.causes[0])) if plan.tier == "T3" else None
+    return Case(
+        plan=plan, truths=tuple(t for _, t in made), theta=theta, priors=priors,
+        motions=tuple(motions), unseen=tuple(unseen), noise=told, velocities=velocities,
+        effects=withheld, detectability=visible, excitation=loops,
+    )  # fmt: skip
+
+
+def _log(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _priors(
+    robot: Robot, causes: Sequence[str], rng: np.random.Generator
+) -> dict[str, tuple[float, float]]:
+    """Return bounds of masses, dampings or both; never of what a cause cannot be told from."""
+    kinds = []
+    if not _LIKE_MASSES & set(causes):
+        kinds.append(robot.masses)
+    if not _LIKE_DAMPINGS & set(causes):
+        kinds.append(robot.dampings)
+    if len(kinds) == 2 and rng.random() < 0.5:
+        kinds = [kinds[int(rng.integers(2))]]
+    return {entry: bounds for kind in kinds for entry, bounds in kind.items()}
+
+
+def _true_model(nominal: mujoco.MjModel, robot: Robot, engine: str) -> mujoco.MjModel:
+    """Return the nominal model with its parameters, on a finer grid or as another engine."""
+    model = nominal_model(robot)
+    for body in range(model.nbody):
+        model.body_mass[body] = nominal.body_mass[body]
+        model.body_inertia[body] = nominal.body_inertia[body]
+    model.dof_damping[:] = nominal.dof_damping
+    if engine == "fine":
+        model.opt.timestep /= robot.refinement
+    else:
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        model.opt.solver = mujoco.mjtSolver.mjSOL_CG
+    return model
+
+
+def sites(model: mujoco.MjModel) -> list[tuple[int, int]]:
+    """Return pairs of an actuator and the degree of freedom that it drives."""
+    return [(a, int(model.jnt_dofadr[model.actuator_trnid[a, 0]])) for a in range(model.nu)]
+
+
+def _cause(
+    name: str, form: str, *, model: mujoco.MjModel, robot: Robot, rng: np.random.Generator
+) -> Made:
+    """Return a cause at a random place."""
+    actuator, dof = sites(model)[int(rng.integers(model.nu))]
+    torque = float(model.actuator_ctrlrange[actuator, 1] * model.actuator_gear[actuator, 0])
+    if robot.name == "cart_pole" and name in BODY and rng.random() < 0.5:
+        dof, torque = 1, 0.7  # the pole's, with about its weight times its half length
+    joint = next(model.joint(j).name for j in range(model.njnt) if model.jnt_dofadr[j] == dof)
+    site = Site(
+        model=model, actuator=actuator, dof=dof, joint=joint, torque=torque,
+        limit=float(model.actuator_ctrlrange[actuator, 1]), control_dt=robot.control_dt,
+        form=form, rng=rng,
+    )  # fmt: skip
+    return CAUSES[name](site)
+
+
+def _motions(
+    plant: Plant, robot: Robot, loops: str, *, count: int, steps: int, rng: np.random.Generator
+) -> list[Motion]:
+    model, motions = plant.model, []
+    limit = model.actuator_ctrlrange[:, 1] * robot.amplitude
+    dofs = np.array([dof for _, dof in sites(model)])
+    for i in range(count):
+        closed = loops == "closed" or (loops == "mixed" and i % 2 == 1)
+        kind = KINDS[i % len(KINDS)]
+        waves = open_loop(kind, steps=steps, dt=robot.control_dt, limit=limit, rng=rng)
+        policy: Policy = lambda k, _, waves=waves: waves[k]
+        if closed:
+            reference = waves / limit * robot.reach + model.qpos0[dofs]
+            full = model.actuator_ctrlrange[:, 1]
+            policy = proportional(reference, dofs, limit=full, reach=1.2 * robot.reach)
+        q = model.qpos0 + robot.spread * rng.uniform(-1, 1, model.nq)
+        v = 0.5 * robot.spread * rng.uniform(-1, 1, model.nv)
+        motions.append(plant.run(q, v, policy, steps=steps))
+    return motions

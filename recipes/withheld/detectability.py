@@ -1,0 +1,98 @@
+"""How visible a cause is to one who knows everything but the cause: ``lambda``.
+
+The nominal simulator, with the true parameters, predicts ``H`` control steps from every ``H``-th
+noise-free measurement. What it misses, ``r``, is whitened by the true noise, of the measurements
+and of the initial state, ``C = R + J P J'``; what changed parameters could account for is projected
+out::
+
+    lambda = || (I - Q Q') L^-1 r ||²,    C = L L',    Q = orth(L^-1 dr/dtheta)
+
+It is the non-centrality of the best test between the cause and none, in all trajectories together.
+"""
+
+from __future__ import annotations
+
+__all__ = ["detectability"]
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+from numpy.typing import NDArray
+
+from .plant import Motion
+from .robots import entry_value, write_entry
+
+Array = NDArray[np.float64]
+
+
+def detectability(
+    model: mujoco.MjModel,
+    motions: Sequence[Motion],
+    *,
+    substeps: int,
+    noise: Array,
+    measured: Array,
+    parameters: Sequence[str],
+    horizon: int = 20,
+) -> float:
+    """Return ``lambda``.
+
+    Args:
+        model: Nominal time step, true parameters, no cause.
+        motions: Of the robot with the cause.
+        substeps: Time steps per control step.
+        noise: Standard deviations of the tangent coordinates, ``(2 nv,)``.
+        measured: Which of them the diagnosis sees, boolean.
+        parameters: Entries of the model that the diagnosis may refit.
+        horizon: Control steps predicted.
+    """
+    start, commands, after = [], [], []
+    for motion in motions:
+        for k in range(6, len(motion.clean) - horizon, horizon):
+            start.append(motion.clean[k])
+            commands.append(motion.ctrl[k : k + horizon])
+            after.append(motion.clean[k + 1 : k + horizon + 1])
+    x, u, y = np.array(start), np.array(commands), np.array(after)
+    width = len(noise)
+
+    def predict(first: Array) -> Array:
+        """Return the measured channels, ``(segments, horizon, channels)``."""
+        return _rollout(model, first, u, substeps)[..., measured]
+
+    base = predict(x)
+    first_noise = np.where(measured, noise, 5.0 * np.resize(noise[: width // 2], width))
+    columns = []
+    for i in range(width):
+        step = first_noise[i] * np.eye(width)[i]
+        columns.append((predict(x + step) - predict(x - step)) / 2)
+    spread = np.stack([c.reshape(len(x), -1) for c in columns], -1)
+    floor = np.tile(noise[measured], horizon) ** 2
+    factor = np.linalg.cholesky(np.eye(len(floor)) * floor + spread @ spread.transpose(0, 2, 1))
+
+    def whiten(residual: Array) -> Array:
+        flat = residual.reshape(len(x), -1, 1)
+        return np.linalg.solve(factor, flat).reshape(-1)
+
+    r = whiten(y[..., measured] - base)
+    tangents = []
+    for entry in parameters:
+        value = entry_value(model, entry)
+        write_entry(model, entry, 1.01 * value)
+        tangents.append(whiten(predict(x) - base))
+        write_entry(model, entry, value)
+    if tangents:
+        q, _ = np.linalg.qr(np.stack(tangents, 1))
+        r = r - q @ (q.T @ r)
+    return float(r @ r)
+
+
+def _rollout(model: mujoco.MjModel, x: Array, u: Array, substeps: int) -> Array:
+    nq, count = model.nq, len(x)
+    state = np.zeros((count, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+    state[:, 1 : 1 + x.shape[1]] = x
+    control = np.repeat(u, substeps, axis=1)
+    data = mujoco.MjData(model)
+    full, _ = rollout.rollout(model, data, state, control)
+    return full[:, substeps - 1 :: substeps, 1 : 1 + nq + model.nv]

@@ -1,0 +1,95 @@
+"""What is handed over, and what is sealed.
+
+The diagnosis is given one folder per case: ``system.yaml``, the nominal model and CSV files. The
+labels are in one file beside them, whose SHA-256 is printed before the first diagnosis starts.
+"""
+
+from __future__ import annotations
+
+__all__ = ["digest", "hand_over", "label", "unseen_folder"]
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import yaml
+
+from .cases import Case
+from .plant import Motion
+from .robots import ROBOTS, nominal_model
+
+
+def hand_over(case: Case, folder: Path) -> None:
+    """Write what the diagnosis may see."""
+    robot = ROBOTS[case.plan.robot]
+    model = nominal_model(robot)
+    joints = [model.joint(j).name for j in range(model.njnt)]
+    actuators = [model.actuator(a).name or f"actuator{a}" for a in range(model.nu)]
+    columns: dict[str, Any] = {
+        "time": "t",
+        "qpos": {joint: f"q_{joint}" for joint in joints},
+        "ctrl": {actuator: f"u_{actuator}" for actuator in actuators},
+    }
+    if case.velocities:
+        columns["qvel"] = {joint: f"v_{joint}" for joint in joints}
+    system: dict[str, Any] = {
+        "simulator": robot.simulator,
+        "control_dt": robot.control_dt,
+        "columns": columns,
+        "parameters": {entry: list(bounds) for entry, bounds in case.priors.items()},
+        "effects": "all" if case.effects is None else list(case.effects),
+    }
+    if case.noise is not None:
+        names = [*columns["qpos"].values(), *columns.get("qvel", {}).values()]
+        system["noise"] = dict(zip(names, map(float, case.noise), strict=False))
+    folder.mkdir(parents=True)
+    (folder / "system.yaml").write_text(yaml.safe_dump(system, sort_keys=False))
+    if robot.simulator == "robot.xml":
+        (folder / "robot.xml").write_text(robot.xml)
+    _write(case.motions, folder, columns=columns, dt=robot.control_dt, model=model)
+
+
+def unseen_folder(case: Case, folder: Path) -> None:
+    """Write noise-free motions with new inputs, for the true shrinkage; sealed with the labels."""
+    folder.mkdir(parents=True)
+    arrays = {f"clean{i}": m.clean for i, m in enumerate(case.unseen)}
+    arrays |= {f"ctrl{i}": m.ctrl for i, m in enumerate(case.unseen)}
+    np.savez_compressed(folder / "unseen.npz", **arrays)
+
+
+def _write(
+    motions: Sequence[Motion], folder: Path, *, columns: dict, dt: float, model: mujoco.MjModel
+) -> None:
+    header = ["t", *columns["qpos"].values(), *columns.get("qvel", {}).values()]
+    header += columns["ctrl"].values()
+    for i, motion in enumerate(motions):
+        time = dt * np.arange(len(motion.ctrl))[:, None]
+        width = 2 * model.nv if "qvel" in columns else model.nv
+        rows = np.concatenate([time, motion.measured[:, :width], motion.ctrl], 1)
+        text = ",".join(header) + "\n"
+        text += "\n".join(",".join(f"{x:.9g}" for x in row) for row in rows) + "\n"
+        (folder / f"run{i:02d}.csv").write_text(text)
+
+
+def label(case: Case) -> dict[str, Any]:
+    """Return what is true of a case."""
+    return {
+        **asdict(case.plan),
+        "truths": [asdict(truth) for truth in case.truths],
+        "theta": case.theta,
+        "detectability": case.detectability,
+        "excitation": case.excitation,
+        "velocities": case.velocities,
+        "runs": len(case.motions),
+        "steps": len(case.motions[0].ctrl),
+        "noise_told": case.noise is not None,
+    }
+
+
+def digest(path: Path) -> str:
+    """Return a file's SHA-256."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()

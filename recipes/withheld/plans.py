@@ -1,0 +1,84 @@
+"""Which cases are drawn: so many of every tier, robot and cause."""
+
+from __future__ import annotations
+
+__all__ = ["CONTROLS", "applicable", "plans"]
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from .cases import Plan
+from .causes_actuation import ACTUATION
+from .causes_body import BODY, CONTACT
+from .causes_foreign import FOREIGN
+from .causes_sensing import SENSING
+from .classes import class_of
+
+CONTROLS = ("parameters", "noise", "shuffled")
+_OTHER_ONLY = {"backlash", "series_elasticity"}  # of two masses, unlike the catalogue's
+_SAME_ONLY = {"armature", "com_shift"}
+
+
+def applicable(robot: str, form: str = "same") -> list[str]:
+    """Return the causes that a robot can have in a form."""
+    names = {**ACTUATION, **BODY, **SENSING}
+    if robot in {"hopper", "half_cheetah"}:
+        names |= CONTACT
+    left = _OTHER_ONLY if form == "same" else _SAME_ONLY
+    if robot == "cart_pole":
+        left = left | _OTHER_ONLY | {"armature"}  # its motor has no rotor
+    return [name for name in names if name not in left]
+
+
+def plans(tiers: Mapping[str, int], robots: Sequence[str], rng: np.random.Generator) -> list[Plan]:
+    """Return plans in random order.
+
+    Args:
+        tiers: Number of cases by tier and robot, ``T0`` to ``T6`` and ``controls`` (of each).
+        robots: Their names.
+        rng: Of causes and order; causes are dealt from shuffled decks, so that all occur alike.
+    """
+    found: list[Plan] = []
+    for robot in robots:
+        for tier, count in tiers.items():
+            found += _tier(tier, robot, count, rng)
+    return [found[i] for i in rng.permutation(len(found))]
+
+
+def _tier(tier: str, robot: str, count: int, rng: np.random.Generator) -> list[Plan]:
+    same, other = applicable(robot), applicable(robot, "other")
+    if tier == "T0":
+        return [Plan(tier, robot)] * count
+    if tier == "controls":
+        return [Plan(name, robot, control=name) for name in CONTROLS for _ in range(count)]
+    if tier == "T5":
+        return [_pair(robot, rng) for _ in range(count)]
+    if tier == "T6":
+        half = [()] * (count - count // 2) + [(name,) for name in _deal(same, count // 2, rng)]
+        return [Plan(tier, robot, causes, engine="other") for causes in half]
+    deck = {"T1": same, "T2": other, "T3": same, "T4": list(FOREIGN)}[tier]
+    form = "other" if tier == "T2" else "same"
+    return [Plan(tier, robot, (name,), form) for name in _deal(deck, count, rng)]
+
+
+def _deal(deck: Sequence[str], count: int, rng: np.random.Generator) -> list[str]:
+    dealt: list[str] = []
+    while len(dealt) < count:
+        dealt += [deck[i] for i in rng.permutation(len(deck))]
+    return dealt[:count]
+
+
+def _pair(robot: str, rng: np.random.Generator) -> Plan:
+    """Return two causes of different classes that leave a parameter to refit."""
+    form = str(rng.choice(["same", "other"]))
+    deck = applicable(robot, form)
+    while True:
+        a, b = (str(name) for name in rng.choice(deck, 2, replace=False))
+        apart = class_of(a) != class_of(b)
+        if apart and not ("viscous_friction" in {a, b} and _divides({a, b})):
+            return Plan("T5", robot, (a, b), form)
+
+
+def _divides(names: set[str]) -> bool:
+    return bool(names & {"action_gain", "payload", "armature", "com_shift"})

@@ -1,0 +1,171 @@
+"""The robot that is diagnosed: a stepping loop with causes, on a finer grid than the simulator's.
+
+In every control step the sensors are read, the command is chosen and logged, and the model runs
+through its time steps; causes change the command that arrives, add generalised forces, alter the
+model, or alter what the sensors say.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Cause", "Motion", "Plant", "Truth"]
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Policy = Callable[[int, Array], Array]  # control step and measurements to commands
+
+
+class Cause:
+    """Something that the nominal simulator lacks; subclasses override what they change.
+
+    Attributes:
+        memory: Hidden state, empty at the start of every trajectory.
+    """
+
+    def __init__(self) -> None:
+        self.memory: dict[str, Any] = {}
+
+    def write(self, model: mujoco.MjModel) -> None:
+        """Alter the model, once."""
+
+    def command(self, u: Array, plant: Plant) -> Array:  # noqa: ARG002
+        """Return what arrives of the commands ``u``, at every time step."""
+        return u
+
+    def force(self, plant: Plant) -> Array | float:  # noqa: ARG002
+        """Return generalised forces, at every time step."""
+        return 0.0
+
+    def sense(self, y: Array, plant: Plant) -> Array:  # noqa: ARG002
+        """Return what the sensors say of the state ``y``, at every control step."""
+        return y
+
+
+@dataclass(frozen=True)
+class Motion:
+    """One trajectory; rows are control steps.
+
+    Attributes:
+        clean: Measured tangent coordinates without noise, ``(T, 2 nv)``.
+        measured: With noise.
+        qpos: Where ``clean`` begins from: positions of the model, with what the sensors add.
+        ctrl: Logged commands, ``(T, nu)``.
+    """
+
+    clean: Array
+    measured: Array
+    qpos: Array
+    ctrl: Array
+
+
+@dataclass
+class Plant:
+    """A model that runs with causes.
+
+    Attributes:
+        model: Finer time step, true physics; it is altered by the causes.
+        control_dt: Seconds between commands.
+        causes: In the order in which they act.
+        noise: Standard deviations of the tangent coordinates' noise, ``(2 nv,)``.
+        rng: Of noise and of random causes.
+    """
+
+    model: mujoco.MjModel
+    control_dt: float
+    causes: Sequence[Cause]
+    noise: Array
+    rng: np.random.Generator
+    data: mujoco.MjData = field(init=False)
+    commands: list[Array] = field(init=False, default_factory=list)
+    states: list[Array] = field(init=False, default_factory=list)
+
+    def __post_init__(self) -> None:
+        for cause in self.causes:
+            cause.write(self.model)
+        mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+        self.data = mujoco.MjData(self.model)
+        self.substeps = round(self.control_dt / self.model.opt.timestep)
+
+    @property
+    def dt(self) -> float:
+        """Seconds of a time step."""
+        return self.model.opt.timestep
+
+    @property
+    def time(self) -> float:
+        """Seconds since the start."""
+        return self.data.time
+
+    @property
+    def q(self) -> Array:
+        """Positions; joints are hinges and slides."""
+        return self.data.qpos
+
+    @property
+    def v(self) -> Array:
+        """Velocities."""
+        return self.data.qvel
+
+    def run(self, q: Array, v: Array, policy: Policy, *, steps: int) -> Motion:
+        """Return a trajectory from a state.
+
+        Raises:
+            FloatingPointError: The simulation diverged.
+        """
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:], self.data.qvel[:] = q, v
+        self.commands, self.states = [], []
+        for cause in self.causes:
+            cause.memory.clear()
+        mujoco.mj_forward(self.model, self.data)
+        clean, measured = [], []
+        for k in range(steps):
+            clean.append(self._read())
+            measured.append(clean[-1] + self.noise * self.rng.standard_normal(len(self.noise)))
+            self.commands.append(np.asarray(policy(k, measured[-1]), dtype=np.float64))
+            for _ in range(self.substeps):
+                self._step()
+        rows, nv = np.array(clean), self.model.nv
+        if not np.isfinite(rows).all() or np.abs(rows).max() > 1e3:
+            raise FloatingPointError("the simulation diverged")
+        return Motion(rows, np.array(measured), rows[:, :nv], np.array(self.commands))
+
+    def _read(self) -> Array:
+        y = np.concatenate([self.q, self.v])
+        self.states.append(y)
+        for cause in self.causes:
+            y = cause.sense(y, self)
+        return y
+
+    def _step(self) -> None:
+        u = self.commands[-1]
+        for cause in self.causes:
+            u = cause.command(u, self)
+        self.data.ctrl[:] = u
+        self.data.qfrc_applied[:] = sum((c.force(self) for c in self.causes), 0.0)
+        mujoco.mj_step(self.model, self.data)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a cause is called by the sealed labels.
+
+    Attributes:
+        name: In the language of the report; a name of its own where the report has none.
+        form: ``same`` as the catalogue's, or ``other``.
+        joint: Where it acts; ``all`` where it acts on everything.
+        channel: ``actuation``, ``body``, ``contact`` or ``sensing``.
+        strength: By unit, where the report has the same definition.
+    """
+
+    name: str
+    form: str
+    joint: str
+    channel: str
+    strength: Mapping[str, float] = field(default_factory=dict)

@@ -1,0 +1,204 @@
+"""Scores of the blind check, with Wilson intervals, by tier, robot and detectability."""
+
+from __future__ import annotations
+
+__all__ = ["finite", "record", "scores", "share", "wilson"]
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+from .classes import class_of
+
+Record = dict[str, Any]
+_Z = 1.959963984540054
+_NAMING = {"named", "named_partial", "ambiguous"}
+_CHANNELS = {"actuation", "body", "contact", "sensing"}
+
+
+def wilson(hits: int, n: int) -> tuple[float, float]:
+    """Return the 95 % interval of a proportion (Wilson 1927)."""
+    if not n:
+        return 0.0, 1.0
+    p, z2 = hits / n, _Z * _Z
+    centre = (p + z2 / (2 * n)) / (1 + z2 / n)
+    half = _Z / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
+    return max(centre - half, 0.0), min(centre + half, 1.0)
+
+
+def share(hits: Iterable[bool]) -> dict[str, Any]:
+    """Return a proportion with its number of cases and interval."""
+    hits = list(hits)
+    value = sum(hits) / len(hits) if hits else None
+    return {"n": len(hits), "value": value, "ci95": wilson(sum(hits), len(hits))}
+
+
+def finite(value: Any) -> Any:
+    """Return what JSON can hold: tuples as lists, numbers of arrays as numbers, no NaN."""
+    if isinstance(value, Mapping):
+        return {str(k): finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(v) for v in value]
+    value = value.item() if hasattr(value, "item") else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def record(
+    label: Mapping[str, Any], report: Mapping[str, Any], shrinks: float | None = None
+) -> Record:
+    """Return what is true of a case and what was said, side by side.
+
+    Args:
+        label: As sealed.
+        report: Of the diagnosis.
+        shrinks: True share of the gap that the named effects remove.
+    """
+    truths = label["truths"]
+    effects = report.get("effects", [])
+    named = [effect["name"] for effect in effects]
+    confused = report.get("confusion_set", [])
+    true = [truth["name"] for truth in truths]
+    one: Record = {
+        **{k: label[k] for k in ("tier", "robot", "form", "engine", "detectability")},
+        **{k: label[k] for k in ("excitation", "velocities", "runs", "noise_told")},
+        "truth": true, "class": [class_of(name) for name in true],
+        "verdict": report["verdict"], "summary": report.get("summary", ""),
+        "named": named, "named_class": [class_of(name) for name in named],
+        "confusion_set": confused, "seconds": report["seconds"],
+        "explained": (report.get("gap") or {}).get("explained_fraction"),
+        "p_value": effects[0]["p_value"] if effects else None,
+    }  # fmt: skip
+    if shrinks is not None and report["verdict"] in _NAMING:
+        gap = report["gap"]
+        one["shrinkage"] = {
+            "true": shrinks, "predicted": gap["explained_fraction"], "ci95": gap["ci95"]
+        }  # fmt: skip
+    if len(truths) == 1:
+        one |= _single(truths[0], effects, confused, report)
+    if len(truths) == 2:
+        found, wanted = set(one["named_class"]), set(one["class"])
+        one["exact"] = found == wanted and len(named) == 2
+        one["extra"] = bool(found - wanted) or len(named) > 2
+    return one
+
+
+def _single(
+    truth: Mapping[str, Any], effects: Sequence[Mapping], confused: Sequence[str], report: Mapping
+) -> Record:
+    first = effects[0] if effects else None
+    one: Record = {
+        "top1": first is not None and first["name"] == truth["name"],
+        "top1_class": first is not None and class_of(first["name"]) == class_of(truth["name"]),
+        "covered": truth["name"] in confused,
+        "covered_class": class_of(truth["name"]) in {class_of(name) for name in confused},
+        "set_size": len(confused),
+    }
+    if first is None:
+        return one
+    if truth["joint"] != "all" and one["top1_class"]:
+        one["joint"] = truth["joint"].split()[0] in _words(first["where"], first["strengths"])
+    channels = (report.get("where") or {}).get("channel") or {}
+    if channels and truth["channel"] in _CHANNELS:
+        one["channel"] = max(channels, key=lambda name: channels[name]) == truth["channel"]
+    if one["top1"] and first["unit"] in truth["strength"] and first["where"] != "all":
+        value = truth["strength"][first["unit"]]
+        low, high = first["ci95"]
+        one["strength_error"] = abs(first["strength"] - value) / abs(value)
+        one["strength_covered"] = low <= value <= high
+    return one
+
+
+def _words(where: str, strengths: Mapping[str, float]) -> set[str]:
+    """Return the words of the place with the largest strength; columns' prefixes cut off."""
+    place = where
+    if where == "all" and strengths:
+        place = max(strengths, key=lambda name: abs(strengths[name]))
+    return {word.removeprefix("q_").removeprefix("v_") for word in place.split()}
+
+
+def scores(records: Sequence[Record], *, threshold: float) -> dict[str, Any]:
+    """Return the scores of all tiers; causes that cannot be seen are reported apart."""
+    visible = [r for r in records if r["detectability"] >= threshold]
+    tiers = {tier: _tier(tier, records, visible) for tier in sorted({r["tier"] for r in records})}
+    known = [r for r in visible if r["tier"] in {"T1", "T2"}]
+    strengths = sorted(r["strength_error"] for r in known if "strength_error" in r)
+    return {
+        "threshold": threshold,
+        "tiers": tiers,
+        "by_robot": {
+            robot: _tiers_of([r for r in records if r["robot"] == robot], threshold)
+            for robot in sorted({r["robot"] for r in records})
+        },
+        "by_detectability": _strata(records),
+        "where": {
+            "channel": share(r["channel"] for r in known if "channel" in r),
+            "joint": share(r["joint"] for r in known if "joint" in r and r["robot"] != "arm"),
+        },
+        "strength": {
+            "n": len(strengths),
+            "median_error": strengths[len(strengths) // 2] if strengths else None,
+            "ci_cover": share(r["strength_covered"] for r in known if "strength_covered" in r),
+        },
+        "shrinkage": _shrinkage([r["shrinkage"] for r in visible if "shrinkage" in r]),
+        "crashes": share(r["verdict"] == "crash" for r in records),
+        "seconds_per_case": sum(r["seconds"] for r in records) / len(records),
+    }
+
+
+def _shrinkage(pairs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the error of the predicted shrinkage and the coverage of its interval."""
+    errors = [abs(p["predicted"] - p["true"]) for p in pairs]
+    covered = share(p["ci95"][0] <= p["true"] <= p["ci95"][1] for p in pairs)
+    mean = sum(errors) / len(errors) if errors else None
+    return {"n": len(pairs), "mae": mean, "ci_cover": covered}
+
+
+def _tiers_of(records: Sequence[Record], threshold: float) -> dict[str, Any]:
+    visible = [r for r in records if r["detectability"] >= threshold]
+    return {tier: _tier(tier, records, visible) for tier in sorted({r["tier"] for r in records})}
+
+
+def _tier(tier: str, every: Sequence[Record], visible: Sequence[Record]) -> dict[str, Any]:
+    mine = [r for r in every if r["tier"] == tier]
+    seen = [r for r in visible if r["tier"] == tier]
+    alarm: Callable[[Record], bool] = lambda r: r["verdict"] not in {"none", "not_testable"}
+    if tier in {"T0", "parameters", "noise"}:
+        return {"n": len(mine), "false_alarm": share(alarm(r) for r in mine)}
+    if tier == "shuffled":
+        return {"n": len(mine), "wrong_named": share(r["verdict"] == "named" for r in mine)}
+    if tier in {"T3", "T4"}:
+        wrong = share(r["verdict"] == "named" for r in seen)
+        return {"n": len(seen), "wrong_named": wrong, "silent": share(not alarm(r) for r in seen)}
+    if tier == "T5":
+        return {
+            "n": len(seen),
+            "exact": share(r["exact"] for r in seen),
+            "any_extra": share(r["extra"] for r in seen),
+        }
+    single = [r for r in seen if len(r["truth"]) == 1]
+    result = {
+        "n": len(single),
+        "top1": share(r["top1"] for r in single),
+        "top1_class": share(r["top1_class"] for r in single),
+        "set_coverage": share(r["covered"] for r in single),
+        "set_coverage_class": share(r["covered_class"] for r in single),
+        "set_size": sum(max(r["set_size"], 1) for r in single) / len(single) if single else None,
+        "named_right": share(r["top1_class"] for r in single if r["verdict"] == "named"),
+        "silent": share(not alarm(r) for r in single),
+    }
+    if tier == "T6":
+        none = [r for r in mine if not r["truth"]]
+        result["none"] = {"n": len(none), "false_alarm": share(alarm(r) for r in none)}
+    return result
+
+
+def _strata(records: Sequence[Record]) -> dict[str, Any]:
+    edges = (0.0, 10.0, 30.0, 100.0, 1000.0, math.inf)
+    single = [r for r in records if r["tier"] in {"T1", "T2"}]
+    return {
+        f"{low:g} to {high:g}": share(
+            r["top1_class"] for r in single if low <= r["detectability"] < high
+        )
+        for low, high in pairwise(edges)
+    }

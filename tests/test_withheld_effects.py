@@ -1,0 +1,307 @@
+"""The blind check: its generator is a path of its own, its causes do what they say, it runs."""
+
+import ast
+import hashlib
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+RECIPES = Path(__file__).parent.parent / "recipes"
+GENERATOR = {
+    *("robots", "plant", "laws", "classes", "excitation", "detectability", "cases", "plans"),
+    *("causes_actuation", "causes_body", "causes_foreign", "causes_sensing", "folders"),
+}
+
+
+@pytest.fixture(autouse=True)
+def recipes_on_path(monkeypatch):
+    monkeypatch.syspath_prepend(RECIPES)
+
+
+def imported(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from ((0, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield node.level, node.module or ""
+
+
+def test_the_generator_imports_nothing_of_the_package():
+    for name in GENERATOR:
+        for level, module in imported(RECIPES / "withheld" / f"{name}.py"):
+            if level:
+                assert level == 1
+                assert module in GENERATOR, f"{name} imports {module}"
+            else:
+                assert module.split(".")[0] in {
+                    *("__future__", "collections", "dataclasses", "hashlib", "math", "pathlib"),
+                    *("re", "typing", "gymnasium", "mujoco", "numpy", "yaml"),
+                }, f"{name} imports {module}"
+
+
+def test_the_generator_runs_without_the_package():
+    code = (
+        "import sys; from withheld import folders, plans\n"
+        "assert not [m for m in sys.modules if m.split('.')[0] in ('torch', 'torchrl_bayessim')]"
+    )
+    environment = os.environ | {"PYTHONPATH": str(RECIPES), "PYTHONWARNINGS": "ignore"}
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)
+
+
+def site(form="same", **changes):
+    from withheld.laws import Site
+    from withheld.robots import ROBOTS, nominal_model
+
+    model = nominal_model(ROBOTS["arm"])
+    values = {
+        "model": model, "actuator": 0, "dof": 0, "joint": "hinge", "limit": 4.0, "torque": 4.0,
+        "control_dt": 0.02, "form": form, "rng": np.random.default_rng(0),
+    }  # fmt: skip
+    return Site(**(values | changes))
+
+
+def plant(*causes, timestep=0.000625, still=False):
+    from withheld.plant import Plant
+    from withheld.robots import ROBOTS, nominal_model
+
+    model = nominal_model(ROBOTS["arm"])
+    model.opt.timestep = timestep
+    if still:  # a free rotor: no gravity, no damping
+        model.opt.gravity[:], model.dof_damping[:] = 0.0, 0.0
+    return Plant(model, 0.02, causes, np.zeros(2), np.random.default_rng(0))
+
+
+def inertia():
+    model = plant().model
+    data, full = mujoco.MjData(model), np.zeros((1, 1))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, full)
+    return full[0, 0]
+
+
+def run(*causes, commands, v=0.0, q=0.0, **options):
+    robot = plant(*causes, **options)
+    values = np.broadcast_to(commands, 50)
+    return robot.run(np.array([q]), np.array([v]), lambda k, _: values[k : k + 1], steps=50)
+
+
+def test_without_causes_it_is_the_nominal_simulator():
+    wave = np.sin(np.arange(50) / 4)
+    fine, coarse = run(commands=wave), run(commands=wave, timestep=0.0025)
+    assert np.abs(fine.clean - coarse.clean).max() < 1e-5
+    np.testing.assert_array_equal(fine.ctrl[:, 0], wave)
+
+
+def test_constant_torque_accelerates_as_newton_says():
+    motion = run(commands=0.1, still=True)
+    t = 0.02 * np.arange(50)
+    np.testing.assert_allclose(motion.clean[:, 1], 0.1 / inertia() * t, rtol=1e-6)
+
+
+def test_coulomb_friction_stops_a_rotor_after_its_time():
+    from withheld.causes_body import coulomb
+
+    for form in ("same", "other"):
+        cause, truth = coulomb(site(form))
+        strength = coulomb(site())[1].strength["N m"]
+        motion = run(cause, commands=0.0, v=0.7 * strength / inertia(), still=True)
+        after = int(0.7 / 0.02)
+        drop = motion.clean[0, 1] - motion.clean[after // 2, 1]
+        assert drop == pytest.approx(strength / inertia() * 0.02 * (after // 2), rel=0.05)
+        assert abs(motion.clean[-1, 1]) < 0.02 * motion.clean[0, 1]
+        assert truth.name == "coulomb_friction"
+
+
+def test_bristles_hold_a_load_below_the_level_and_let_go_above():
+    from withheld.causes_body import coulomb
+
+    strength = coulomb(site())[1].strength["N m"]
+    held = run(coulomb(site("other"))[0], commands=0.5 * strength, still=True)
+    moved = run(coulomb(site("other"))[0], commands=2.0 * strength, still=True)
+    assert abs(held.clean[-1, 0]) < 0.01
+    assert moved.clean[-1, 0] > 0.1
+
+
+@pytest.mark.parametrize("form", ["same", "other"])
+def test_delay_moves_a_step_by_its_time(form):
+    from withheld.causes_actuation import delay
+
+    cause, truth = delay(site(form))
+    seconds = delay(site())[1].strength["s"]
+    step = np.where(np.arange(50) < 10, 0.0, 1.0)
+    late, prompt = run(cause, commands=step, still=True), run(commands=step, still=True)
+    # a constant torque that begins later by s lacks the momentum of that time
+    lost = (prompt.clean[-1, 1] - late.clean[-1, 1]) * inertia()
+    assert lost == pytest.approx(seconds, rel=0.01 if form == "same" else 0.3)
+    assert truth.joint == "all"
+
+
+def test_viscous_friction_decays_exponentially():
+    from withheld.causes_body import viscous
+
+    cause, truth = viscous(site())
+    rate = truth.strength["N m s/rad"] / inertia()
+    motion = run(cause, commands=0.0, v=1.0, still=True)
+    np.testing.assert_allclose(motion.clean[:, 1], np.exp(-rate * 0.02 * np.arange(50)), rtol=1e-2)
+
+
+def test_saturation_dead_band_gain_and_bias_are_what_the_label_says():
+    from withheld import causes_actuation as actuation
+
+    def arrives(made, u):
+        return made[0].command(np.array([u]), plant())[0]
+
+    cut = actuation.saturation(site())
+    assert arrives(cut, 4.0) == pytest.approx(4.0 * (1 - cut[1].strength["fraction"]))
+    band = actuation.dead_band(site())
+    width = band[1].strength["N m"]
+    assert arrives(band, width / 2) == 0.0
+    assert arrives(band, -1 - width) == pytest.approx(-1.0)
+    louder = actuation.gain(site())
+    assert arrives(louder, 2.0) == pytest.approx(2.0 * (1 + louder[1].strength["fraction"]))
+    pushed = actuation.bias(site())
+    assert arrives(pushed, 2.0) == pytest.approx(2.0 + pushed[1].strength["N m"])
+
+
+def test_a_rotor_behind_a_spring_reaches_the_same_momentum():
+    from withheld.causes_actuation import series_elasticity
+
+    # the rotor's inertia is the armature, so the sum is the nominal inertia
+    motion = run(series_elasticity(site("other"))[0], commands=0.1, still=True)
+    assert motion.clean[-1, 1] == pytest.approx(0.1 * 0.98 / inertia(), rel=0.1)
+
+
+def test_backlash_leaves_play_and_nothing_else():
+    from withheld.causes_actuation import backlash
+
+    motion = run(backlash(site("other"))[0], commands=0.1, still=True)
+    stiff = run(commands=0.1, still=True)
+    lag = stiff.clean[-1, 0] - motion.clean[-1, 0]
+    assert 0.0 < lag < 0.2 * stiff.clean[-1, 0]
+
+
+def test_tilt_turns_the_rest_position_by_its_angle():
+    from withheld.causes_body import tilt
+
+    cause, truth = tilt(site())
+    robot = plant(cause)
+    steps = 600
+    motion = robot.run(np.zeros(1), np.zeros(1), lambda *_: np.zeros(1), steps=steps)
+    assert abs(motion.clean[-1, 0]) == pytest.approx(abs(truth.strength["rad"]), rel=1e-3)
+
+
+def test_sensors_say_what_the_label_says():
+    from withheld import causes_sensing as sensing
+
+    for make, expected in (
+        (sensing.bias, lambda s, q, v, t: (q + s["rad"], v)),
+        (sensing.gain, lambda s, q, v, t: (q, v * (1 + s["fraction"]))),
+        (sensing.drift, lambda s, q, v, t: (q + s["rad/s"] * t, v)),
+    ):
+        cause, truth = make(site())
+        seen, true = run(cause, commands=1.0), run(commands=1.0)
+        q, v = true.clean.T
+        expectation = np.stack(expected(truth.strength, q, v, 0.02 * np.arange(50)), 1)
+        np.testing.assert_allclose(seen.clean, expectation, atol=1e-9)
+
+
+def test_payload_at_the_tip_has_the_inertia_of_a_point():
+    from withheld.causes_body import payload
+
+    cause, _ = payload(site("other"))
+    share = 0.02 * math.exp(np.random.default_rng(0).uniform() * math.log(30.0))
+    before, model = inertia(), plant(cause).model
+    data, full = mujoco.MjData(model), np.zeros((1, 1))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, full)
+    assert full[0, 0] - before == pytest.approx(share * 1.0 * 0.4**2, rel=1e-6)
+
+
+def test_every_cause_changes_the_motion_and_is_called_what_it_is():
+    from withheld.cases import CAUSES
+    from withheld.plans import applicable
+
+    wave = 3.0 * np.sin(np.arange(50) / 3)
+    plain = run(commands=wave, v=9.0).clean
+    for form in ("same", "other"):
+        for name in applicable("arm", form):
+            cause, truth = CAUSES[name](site(form))
+            assert (truth.name, truth.form) == (name, form)
+            assert np.abs(run(cause, commands=wave, v=9.0).clean - plain).max() > 1e-5, (name, form)
+
+
+def test_detectability_is_nothing_without_a_cause_and_grows_with_it():
+    from withheld.cases import Plan, make
+
+    none = make(Plan("T0", "arm"), np.random.default_rng(3))
+    some = make(Plan("T1", "arm", ("coulomb_friction",)), np.random.default_rng(3))
+    assert none.detectability < 0.5
+    assert some.detectability > 100
+
+
+def test_wilson_intervals():
+    from withheld.scoring import wilson
+
+    assert wilson(0, 0) == (0.0, 1.0)
+    low, high = wilson(45, 50)  # Newcombe (1998), by the formula
+    assert (low, high) == (pytest.approx(0.7864, abs=1e-4), pytest.approx(0.9565, abs=1e-4))
+    assert wilson(0, 300)[1] == pytest.approx(0.0126, abs=1e-4)
+
+
+def test_no_name_is_in_two_classes_and_the_true_one_is_withheld():
+    from withheld.classes import NAMES, class_of, without_class_of
+
+    assert len(set(NAMES)) == len(NAMES) == 39
+    for name in NAMES:
+        left = without_class_of(name)
+        assert name not in left
+        assert class_of(name) not in {class_of(other) for other in left}
+
+
+def test_bad_settings_are_explained(tmp_path, monkeypatch, capsys):
+    import recipe
+    import withheld_effects
+
+    monkeypatch.chdir(tmp_path)
+    for argument, said in (
+        ("robots=arms", "got 'arms'. Available: arm (did you mean this?)"),
+        ("tiers=T0", "expected tiers such as T0=4,T2=10, got 'T0'"),
+        ("tiers=T9=1", "expected a tier, got 'T9'"),
+    ):
+        monkeypatch.setattr(sys, "argv", ["withheld_effects.py", argument])
+        with pytest.raises(SystemExit, match="2"):
+            recipe.main(withheld_effects.Withheld, withheld_effects.job)
+        assert said in capsys.readouterr().err
+
+
+def test_it_seals_diagnoses_and_scores(tmp_path):
+    command = [sys.executable, str(RECIPES / "withheld_effects.py"), "robots=arm"]
+    command += ["tiers=T0=1,T1=1", "progress=false", "out=run", "seed=5"]
+    environment = os.environ | {"PYTHONWARNINGS": "ignore"}
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    first, *_, last = done.stdout.splitlines()
+    sealed = tmp_path / "run" / "sealed" / "labels.json"
+    digest = hashlib.sha256(sealed.read_bytes()).hexdigest()
+    assert first == f"labels sealed: sha256 {digest}"
+    result = json.loads(last.removeprefix("RESULT "))
+    assert result["labels_sha256"] == digest
+    assert {"tiers", "where", "shrinkage", "seconds_per_case"} <= result.keys()
+    assert result["tiers"]["T0"]["n"] == 1
+    assert result["crashes"]["value"] == 0.0
+    for case in (tmp_path / "run" / "cases").iterdir():
+        handed = {path.name for path in case.iterdir()}
+        assert handed - {path.name for path in case.glob("run*.csv")} == {
+            "system.yaml", "robot.xml"
+        }  # fmt: skip
+    said = {path.name for path in (tmp_path / "run").iterdir()}
+    assert {"page.md", "confusion.png", "calibration.png", "records.json"} <= said
