@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from ..effects.catalogue import CATALOGUE, effect
 from ..effects.effect import Effect
@@ -59,31 +60,32 @@ def diagnose(
     begun = time.perf_counter()
     system = _system(simulator, prior)
     chosen = _effects(system, effects)
-    robot = system.robot
-    units = [u for u in units_of(chosen, robot) if not u.effect.random]
+    units = [u for u in units_of(chosen, system.robot) if not u.effect.random]
     generator = np.random.default_rng(seed)
-    progress("fitting the parameters")
-    prepared = prepare(system, logs, units, generator=generator, horizon=horizon)
-    selection = select(
-        prepared.sets["train"],
-        prepared.sets["validation"],
-        prepared.nominal,
-        units,
-        alpha=_ALPHA,
-        generator=generator,
-        progress=progress,
-    )
-    progress("opening the test runs")
-    return assemble(
-        system,
-        logs,
-        prepared=prepared,
-        selection=selection,
-        findings=findings,
-        generator=generator,
-        begun=begun,
-        alpha=_ALPHA,
-    )
+    # many small matrices: threads of their own cost more than they bring
+    with threadpool_limits(1, user_api="blas"):
+        progress("fitting the parameters")
+        prepared = prepare(system, logs, units, generator=generator, horizon=horizon)
+        selection = select(
+            prepared.sets["train"],
+            prepared.sets["validation"],
+            prepared.nominal,
+            units,
+            alpha=_ALPHA,
+            generator=generator,
+            progress=progress,
+        )
+        progress("opening the test runs")
+        return assemble(
+            system,
+            logs,
+            prepared=prepared,
+            selection=selection,
+            findings=findings,
+            generator=generator,
+            begun=begun,
+            alpha=_ALPHA,
+        )
 
 
 def _system(simulator: str | Task | System, prior: BoxPrior | None) -> System:

@@ -1,7 +1,9 @@
 """How well parameters and effects explain segments: weighted innovations of many points at once.
 
 A *point* is a parameter vector in standardised units (the prior has mean 0 and standard deviation
-1) and strengths of some *units*, an effect at one of its targets each. Its cost is::
+1), of which the last says how much of the time step's error the data have (0: they are like the
+simulator's own, 1: exact), and strengths of some *units*, an effect at one of its targets each. Its
+cost is::
 
     Σ_i w_i ‖L_i⁻¹ r_i(θ, s)‖² / φ + ‖z(θ)‖²,
 
@@ -11,7 +13,7 @@ already absorbed it.
 
 from __future__ import annotations
 
-__all__ = ["Objective", "Point", "Unit", "strengths_of", "units_of"]
+__all__ = ["Objective", "Point", "Unit", "parameters_at", "strengths_of", "units_of"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -89,7 +91,7 @@ class Point:
     """A candidate explanation.
 
     Attributes:
-        z: Standardised parameters, shape ``(D,)``.
+        z: Standardised parameters and the time step's share, shape ``(D + 1,)``.
         strengths: Strengths of the units that are on.
     """
 
@@ -115,8 +117,8 @@ class Objective:
 
     @property
     def size(self) -> int:
-        """The number of parameters ``D``."""
-        return 0 if self.prior is None else len(self.prior.names)
+        """The number of coordinates ``D + 1``."""
+        return 1 + (0 if self.prior is None else len(self.prior.names))
 
     def thinned(self, every: int) -> Objective:
         """Return the objective on every so many segments."""
@@ -127,9 +129,7 @@ class Objective:
 
     def theta(self, z: Array) -> Array:
         """Return parameters in their own units, shape ``(*, D)``."""
-        if self.prior is None:
-            return np.zeros((*z.shape[:-1], 0))
-        return self.prior.unstandardize(torch.from_numpy(z)).double().numpy()
+        return parameters_at(self.prior, z)
 
     def raw(self, points: Sequence[Point]) -> Array:
         """Return residuals, shape ``(P, S, K, C)``."""
@@ -139,7 +139,16 @@ class Objective:
 
     def __call__(self, points: Sequence[Point]) -> Array:
         """Return weighted innovations, shape ``(P, S, KC)``."""
-        return self.whitening(self.raw(points))
+        share = np.array([point.z[-1] for point in points])
+        drift = self.whitening.drift * self.whitening.weights[:, None]
+        return self.whitening(self.raw(points)) - share[:, None, None] * drift
+
+
+def parameters_at(prior: Prior | None, z: Array) -> Array:
+    """Return the parameters of points ``(*, D + 1)`` in their own units, shape ``(*, D)``."""
+    if prior is None:
+        return np.zeros((*z.shape[:-1], 0))
+    return prior.unstandardize(torch.from_numpy(z[..., :-1])).double().numpy()
 
 
 def strengths_of(points: Sequence[Point], robot: Robot) -> Strengths:

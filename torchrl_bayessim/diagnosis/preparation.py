@@ -12,14 +12,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ..effects.catalogue import effect
 from ..errors import message
 from ..logs.log import Log
 from ..logs.system import System
-from .objective import Objective, Point, Unit, units_of
+from .objective import Objective, Point, Unit, parameters_at, units_of
 from .prediction import Predictor
 from .refit import Fit, refit
 from .segments import Segments, cut
@@ -31,6 +30,7 @@ _CHECKS = 10  # compared rows per segment
 _SKIP = 5  # control steps: the longest delay
 _HISTORY = 0.4  # seconds of commands that delay lines and filters look back at
 _ROWS = {"train": 900, "validation": 600, "test": 600}  # control steps simulated per candidate
+_FEWEST = 12  # rows of a run
 _PROBE = 160
 _WORTH = 0.2  # nats per effect that a longer horizon must bring
 
@@ -119,6 +119,10 @@ def prepare(
     predictor = Predictor(system) if predictor is None else predictor
     alarms: list[str] = []
     parts = split(logs)
+    shortest = min(max(len(log) for log in part) for part in parts.values())
+    if shortest <= max(_FEWEST, horizon or 0):
+        expected = f"runs of more than {max(_FEWEST, horizon or 0)} rows in every split"
+        raise ValueError(message(expected, f"{shortest} rows", hint="record longer"))
     if len(logs) < 3:
         alarms.append(
             f"{len(logs)} trajectories: training, validation and test are stretches of the same "
@@ -130,9 +134,7 @@ def prepare(
         horizon = _horizon(
             predictor, system, parts["train"], units=units, noise=noise, history=history
         )
-    shortest = min(max(len(log) for log in part) for part in parts.values())
-    if horizon >= shortest:
-        horizon = max(1, shortest // 2)
+        horizon = min(horizon, shortest // 2)
     pieces = {
         name: cut(
             part,
@@ -152,13 +154,7 @@ def prepare(
 
 
 def _start(system: System) -> Array:
-    return np.zeros(0 if system.prior is None else len(system.prior.names))
-
-
-def _theta(system: System, z: Array) -> Array:
-    if system.prior is None:
-        return np.zeros(0)
-    return system.prior.unstandardize(torch.from_numpy(z)).double().numpy()
+    return np.zeros(1 + (0 if system.prior is None else len(system.prior.names)))
 
 
 def _noise(
@@ -177,12 +173,12 @@ def _noise(
     tiny = 1e-6 * system.robot.channel_scale.numpy()
     noise = np.maximum(np.where(np.isnan(given), smooth, given), tiny)
     steps = min(8, min(len(log) for log in logs) // 2)
-    pieces = cut(logs, steps, history=history, most=100, burn_in=history)
+    pieces = cut(logs, steps, history=history, most=60, burn_in=history)
     pushes = units_of([effect("constant_force")], system.robot)
     pushes = [unit for unit in pushes if unit.where != "all"]
     z = _start(system)
-    for _ in range(3):
-        white = whitening(predictor, pieces, _theta(system, z), noise)
+    for _ in range(2):
+        white = whitening(predictor, pieces, parameters_at(system.prior, z), noise)
         objective = Objective(predictor, system.prior, pieces, white)
         fit = refit(objective, [Point(z)], iterations=3)[0]
         z = fit.point.z
@@ -232,7 +228,7 @@ def _horizon(
             burn_in=history,
             skip=_SKIP,
         )
-        white = whitening(predictor, pieces, _theta(system, z), noise)
+        white = whitening(predictor, pieces, parameters_at(system.prior, z), noise)
         if white.curvature > 1.0 and np.isfinite(best):
             break
         objective = Objective(predictor, system.prior, pieces, white)
@@ -256,15 +252,17 @@ def _nominal(
 ) -> tuple[Fit, dict[str, Whitening]]:
     """Fit the parameters, with the whitening and the robust weights that belong to the fit."""
     z = _start(system)
-    white = whitening(predictor, pieces["train"], _theta(system, z), noise)
+    white = whitening(predictor, pieces["train"], parameters_at(system.prior, z), noise)
     for _ in range(2):
         objective = Objective(predictor, system.prior, pieces["train"], white)
         plain = refit(objective, [Point(z)], iterations=6)[0]
         z = plain.point.z
-        white = whitening(predictor, pieces["train"], _theta(system, z), noise)
+        white = whitening(predictor, pieces["train"], parameters_at(system.prior, z), noise)
     whitenings = {}
     for name, part in pieces.items():
-        bare = whitening(predictor, part, _theta(system, z), noise, generator=generator)
+        bare = whitening(
+            predictor, part, parameters_at(system.prior, z), noise, generator=generator
+        )
         innovations = Objective(predictor, system.prior, part, bare)([Point(z)])[0]
         whitenings[name] = bare.weighted(innovations)
     objective = Objective(predictor, system.prior, pieces["train"], whitenings["train"])

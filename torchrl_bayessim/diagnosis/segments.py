@@ -124,7 +124,7 @@ def cut(
     if most is not None and len(found) > most:
         keep = np.linspace(0, len(found) - 1, most).round().astype(int)
         found = [found[i] for i in keep]
-    step = 1 if checks is None else max(1, (horizon - skip) // checks)
+    step = 1 if checks is None else max(1, -(-(horizon - skip) // checks))
     checked = np.arange(horizon, min(skip, horizon // 2), -step)[::-1].astype(np.int64)
     offsets = np.arange(-history, horizon + history + 1)
 

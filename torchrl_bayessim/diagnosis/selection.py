@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from ..effects.effect import ForceEffect
 from .objective import Objective, Point, Unit
 from .refit import Fit, fit_on, refit
 from .screening import Screen, screen
@@ -27,9 +28,11 @@ Array = NDArray[np.float64]
 _LIKELY = 6.0  # a deviance that chance often makes
 _DEVIATIONS = 2.3  # of a normal distribution: one in a hundred
 _SHARE = 0.1  # of the gap: what an effect that could be another must remove to be kept
+_REST = 0.5  # of what the base leaves: what any further effect must remove
+_WRONG = 1.5  # mean squared innovation of a base that something is missing from
 _MOST = 4  # effects in one explanation
 _RIVALS, _PAIRS, _GROUPS = 6, 4, 3  # models refitted: in an effect's place, pairs, several targets
-_SURVIVORS = 8  # models of a round that are fitted to the end
+_SURVIVORS = 7  # models of a round that are fitted to the end
 _MANY, _APART, _MATTER = 150, 4, 8  # units, targets of one effect, effects to look at singly
 _FEW = 8  # segments on which a round begins
 _BENT = 5.0  # mean squared innovation of a nominal fit that may have gone astray
@@ -117,10 +120,10 @@ def select(
         progress("fitting explanations")
         models = _explanations(train, validation, best, seen)
         tried += models
-        better = _chosen(best, models, alpha)
+        better = _needed_only(start, best, _chosen(best, models, alpha), models=models, alpha=alpha)
         if better is None or not _identified(start, best, better, models):
             break
-        best = better
+        best = _exactly(train, validation, better)
     progress("taking out what is not needed")
     best, dropped = _eliminated(train, validation, best, alpha)
     tried += dropped
@@ -130,6 +133,18 @@ def select(
         alternatives = _alternatives(train, validation, best, units=units, tried=tried)
         tried += [model for models in alternatives.values() for model in models]
     return Selection(start, best, tuple(screens), tuple(p_values), tuple(tried), alternatives)
+
+
+def _exactly(train: Objective, validation: Objective, model: Model) -> Model:
+    """Fit a model with forces that follow the state at every time step, if it has any.
+
+    Held for 10 ms they lag, and what lags looks like a delay to the next round.
+    """
+    forced = any(isinstance(unit.effect, ForceEffect) for unit in model.units)
+    if not forced or train.predictor.exact:
+        return model
+    train.predictor.exact = validation.predictor.exact = True
+    return _judged(validation, refit(train, [model.fit.point], iterations=2))[0]
 
 
 def _screened(train: Objective, fit: Fit, units: Sequence[Unit]) -> Screen:
@@ -180,8 +195,8 @@ def _explanations(
     kept = starts
     if len(starts) > _SURVIVORS:
         some = train.thinned(max(1, len(train.segments) // _FEW))
-        kept = [fit.point for fit in _fittest(refit(some, starts, iterations=2, quick=True))]
-    return _judged(validation, refit(train, kept, iterations=4))
+        kept = [fit.point for fit in _fittest(refit(some, starts, iterations=1, quick=True))]
+    return _judged(validation, refit(train, kept, iterations=3))
 
 
 def _fittest(fits: Sequence[Fit]) -> list[Fit]:
@@ -301,24 +316,48 @@ def _chosen(base: Model, models: Sequence[Model], alpha: float) -> Model | None:
     return min(better, key=lambda m: _criterion(m, dispersion))
 
 
+def _needed_only(
+    start: Model,
+    base: Model,
+    better: Model | None,
+    *,
+    models: Sequence[Model],
+    alpha: float,
+) -> Model | None:
+    """Return the best model, or the one with a single new effect if more are a stopgap."""
+    if better is None or len({u.name for u in better.units if u not in base.units}) < 2:
+        return better
+    single = [m for m in models if len({u.name for u in m.units if u not in base.units}) == 1]
+    smaller = _chosen(base, single, alpha)
+    if smaller is None or _identified(start, smaller, better, models):
+        return better
+    return smaller
+
+
 def _identified(start: Model, base: Model, better: Model, models: Sequence[Model]) -> bool:
     """Return whether what is added to a base with effects is more than a stopgap.
 
     A model that is right but for the form of a law leaves a little that many effects can mend. An
-    effect is added only if those that mend it as well are of its kind, or if it matters.
+    effect is added only if it matters: to the gap, or, if nothing else could mend it as well, to
+    what the base leaves.
     """
     if not base.units:
         return True
-    gap = float((start.validation**2).sum()) - start.validation.size
-    if _gain(base, better) * better.dispersion() > _SHARE * gap:
+    alone, before, after = (
+        float(np.mean(np.r_[(m.fit.innovations**2).ravel(), (m.validation**2).ravel()]))
+        for m in (start, base, better)
+    )
+    if before - after > _SHARE * (alone - 1.0):
         return True
+    if before - after < _REST * (before - 1.0):
+        return False
     added = {u.effect.group for u in better.units if u not in base.units}
     rivals = [
         {u.effect.group for u in m.units if u not in base.units}
         for m in models
         if m is not better and as_good(better, m)
     ]
-    return all(groups <= added or groups == added for groups in rivals)
+    return before > _WRONG and all(groups <= added for groups in rivals)
 
 
 def _gain(base: Model, model: Model) -> float:

@@ -3,13 +3,14 @@
 The residual of segment ``i``, measured noise with covariance ``R`` at every compared row and a
 start state known only up to ``P0``, has covariance::
 
-    C_i = I ⊗ R + J_i P0 J_iᵀ + Σ_j κ_ij κ_ijᵀ + δ_i δ_iᵀ,    κ_ij = (ŷ⁺ + ŷ⁻ - 2ŷ) / 2,
+    C_i = I ⊗ R + J_i P0 J_iᵀ + Σ_j κ_ij κ_ijᵀ + ¼ δ_i δ_iᵀ,    κ_ij = (ŷ⁺ + ŷ⁻ - 2ŷ) / 2,
 
 ``J_i`` the derivative with respect to the start state by central differences of one standard
 deviation each. The second differences κ grow where contacts switch, and so tell the analysis not
 to trust exactly those segments. ``δ_i`` is what the time step does: twice the difference that half
 the time step makes, by Richardson's extrapolation of a method of first order, since a simulator
-that integrates coarsely is not a robot with another physics. With ``C_i = L_i L_iᵀ``, ``L_i⁻¹ r_i``
+that integrates coarsely is not a robot with another physics. What of it is common to all segments
+is fitted, with one coefficient (see `objective`). With ``C_i = L_i L_iᵀ``, ``L_i⁻¹ r_i``
 are innovations: white, of unit variance, for a perfect simulator.
 """
 
@@ -18,7 +19,7 @@ from __future__ import annotations
 __all__ = ["Whitening", "innovation_noise", "noise_from_differences", "whitening"]
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,12 +42,14 @@ class Whitening:
         inverse: ``L⁻¹`` of each segment, shape ``(S, KC, KC)``.
         weights: Square roots of the segments' robust weights, shape ``(S,)``.
         spread: Standard deviations of the residuals under noise alone, ``(S, K, C)``.
+        drift: Innovations that the time step makes, by extrapolation, shape ``(S, KC)``.
         curvature: Median over segments of ``‖κ‖ / ‖J‖``: above one the horizon is too long.
     """
 
     inverse: Array
     weights: Array
     spread: Array
+    drift: Array
     curvature: float
 
     def __call__(self, residual: Array) -> Array:
@@ -58,8 +61,8 @@ class Whitening:
 
     def take(self, index: NDArray[np.int64]) -> Whitening:
         """Return that of some of the segments."""
-        arrays = self.inverse[index], self.weights[index], self.spread[index]
-        return Whitening(*arrays, self.curvature)
+        names = "inverse", "weights", "spread", "drift"
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
 
     def weighted(self, innovations: Array) -> Whitening:
         """Return the same with Huber's weights for these innovations, ``(S, KC)``.
@@ -70,7 +73,7 @@ class Whitening:
         """
         size = np.sqrt((innovations**2).mean(-1))
         weight = np.minimum(1.0, 1.5 * np.median(size) / np.maximum(size, 1e-12))
-        return Whitening(self.inverse, np.sqrt(weight), self.spread, self.curvature)
+        return Whitening(self.inverse, np.sqrt(weight), self.spread, self.drift, self.curvature)
 
 
 def whitening(
@@ -106,8 +109,8 @@ def whitening(
     plus, minus, nominal = flat[1::2], flat[2::2], flat[0]
     slope, curve = (plus - minus) / 2, (plus + minus - 2 * nominal) / 2
     spread = np.einsum("jsm,jsn->smn", slope, slope) + np.einsum("jsm,jsn->smn", curve, curve)
-    step = 2.0 * np.nan_to_num(finer.reshape(size, -1) - nominal)
-    spread += step[:, :, None] * step[:, None, :]
+    step = 2.0 * (nominal - np.nan_to_num(finer.reshape(size, -1)))
+    spread += 0.25 * step[:, :, None] * step[:, None, :]
     spread[:, np.arange(checks * channels), np.arange(checks * channels)] += np.tile(
         noise**2, checks
     )
@@ -116,7 +119,8 @@ def whitening(
     if generator is not None:
         drawn = generator.standard_normal((_DRAWS, size, len(start))) * start
         moved = predictor.residuals(segments, np.repeat(theta[None], _DRAWS, 0), None, drawn)
-        made = moved - finer + noise * generator.standard_normal(moved.shape)
+        made = moved - finer - (step / 2).reshape(finer.shape)
+        made += noise * generator.standard_normal(moved.shape)
         white = np.matmul(inverse, np.nan_to_num(made, nan=_WORST).reshape(_DRAWS, size, -1, 1))
         excess = np.minimum((white**2).mean((0, 2, 3)), _WORST)
         inverse /= np.sqrt(np.maximum(excess, 1.0))[:, None, None]
@@ -124,7 +128,8 @@ def whitening(
     bent = np.linalg.norm(curve, axis=(0, 2)) / np.maximum(
         np.linalg.norm(slope, axis=(0, 2)), 1e-12
     )
-    return Whitening(inverse, np.ones(size), np.sqrt(variance), float(np.median(bent)))
+    drift = np.matmul(inverse, step[..., None])[..., 0]
+    return Whitening(inverse, np.ones(size), np.sqrt(variance), drift, float(np.median(bent)))
 
 
 def _start_noise(predictor: Predictor, segments: Segments, noise: Array) -> Array:

@@ -1,0 +1,161 @@
+"""Small robots whose cause is known; the generator steps MuJoCo itself."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.report import Report
+from torchrl_bayessim.envs.task import Task
+from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.logs.log import Log
+from torchrl_bayessim.logs.system import System
+from torchrl_bayessim.physics.mujoco import MujocoPhysics
+
+ARM = """
+<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+  <body name="link"><joint name="hinge" axis="0 1 0" damping=".05"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass=".6"/></body>
+</worldbody><actuator><motor name="motor" joint="hinge" ctrlrange="-4 4"/></actuator></mujoco>
+"""
+BOUNDS = {"body_mass[link]": (0.4, 0.9), "dof_damping[hinge]": (0.0, 0.2)}
+FINER = 4
+
+
+def system():
+    model = mujoco.MjModel.from_xml_string(ARM)
+    task = Task(model=model, frame_skip=5)
+    return System(task=task, physics=MujocoPhysics(*BOUNDS), prior=BoxPrior(BOUNDS))
+
+
+def commands(rng, steps):
+    t = 0.01 * np.arange(steps)
+    waves = [rng.normal() * np.sin(2 * np.pi * rng.uniform(0.2, 2.5) * t) for _ in range(4)]
+    return np.clip(np.sum(waves, axis=0), -4, 4)
+
+
+def run(rng, steps, act=lambda u, k: u[k], push=lambda q, v: 0.0):
+    """Return what a robot with another mass and damping does, measured with noise."""
+    model = mujoco.MjModel.from_xml_string(ARM)
+    model.body_mass[1] *= 1.1
+    model.body_inertia[1] *= 1.1
+    model.dof_damping[0] = 0.08
+    model.opt.timestep /= FINER
+    data = mujoco.MjData(model)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    data.qpos[0] = rng.normal(scale=0.5)
+    u, rows = commands(rng, steps), []
+    for k in range(steps):
+        rows.append((data.qpos[0], data.qvel[0]))
+        data.ctrl[0] = act(u, k)
+        for _ in range(5 * FINER):
+            data.qfrc_applied[0] = push(data.qpos[0], data.qvel[0])
+            mujoco.mj_step(model, data)
+    state = np.array(rows) + rng.normal(size=(steps, 2)) * [0.002, 0.02]
+    return state, u
+
+
+def logs(count=6, steps=200, seed=0, **cause):
+    rng = np.random.default_rng(seed)
+    result = []
+    for i in range(count):
+        state, u = run(rng, steps, **cause)
+        result.append(
+            Log(
+                name=f"run{i}",
+                time=0.01 * torch.arange(steps).double(),
+                qpos=torch.from_numpy(state[:, :1].copy()),
+                qvel=torch.from_numpy(state[:, 1:].copy()),
+                ctrl=torch.from_numpy(u[:, None].copy()),
+                velocity_gain=torch.zeros(1).double(),
+                measured=torch.ones(2, dtype=torch.bool),
+            )
+        )
+    return result
+
+
+SOME = (
+    "action_delay", "action_lag", "action_bias", "action_gain", "dead_band", "coulomb_friction",
+    "quadratic_drag", "parallel_spring", "payload", "sensor_bias", "sensor_delay",
+)  # fmt: skip
+
+
+def test_a_clean_simulator_has_no_gap():
+    report = diagnose(system(), None, logs(), effects=SOME)
+    assert report.verdict == "none"
+    assert not report.effects
+    assert "No gap above noise" in str(report)
+    found = {p.name: p.with_effects for p in report.parameters}
+    assert found["body_mass[link]"] == pytest.approx(0.66, rel=0.02)
+    assert found["dof_damping[hinge]"] == pytest.approx(0.08, rel=0.1)
+    noise = report.audit["noise"]
+    assert noise["hinge position"] == pytest.approx(0.002, rel=0.2)
+    assert noise["hinge velocity"] == pytest.approx(0.02, rel=0.2)
+    friction = next(c for c in report.candidates if c.name == "coulomb_friction")
+    assert friction.status == "ruled_out"
+    assert friction.minimal_detectable_strength < 0.05
+
+
+def test_dry_friction_is_named_and_measured():
+    data = logs(push=lambda q, v: -0.15 * np.tanh(v / 0.01))
+    report = diagnose(system(), None, data, effects=SOME)
+    assert report.verdict in {"named", "named_partial"}
+    assert report.effects[0].name == "coulomb_friction"
+    assert report.effects[0].where == "hinge"
+    assert report.effects[0].strength == pytest.approx(0.15, rel=0.1)
+    assert report.gap.explained_fraction > 0.9
+    errors = report.gap.rollout_rmse
+    assert errors["with_effects"]["hinge position"] < errors["refit"]["hinge position"] / 3
+    assert [effect.name for effect in report.effects] == ["coulomb_friction"]
+    assert report.where["channel"]["body"] == 1.0
+
+
+def test_a_late_command_is_named_with_what_it_cannot_be_told_from():
+    report = diagnose(system(), None, logs(act=lambda u, k: u[max(0, k - 2)]), effects=SOME)
+    assert {"action_delay", "sensor_delay"} & set(report.confusion_set)
+    assert report.effects[0].strength == pytest.approx(0.02, rel=0.1)
+
+
+def test_a_cause_that_is_not_in_the_catalogue_is_not_named_without_reserve():
+    data = logs(push=lambda q, v: -1.5 * max(q - 0.6, 0.0))
+    report = diagnose(system(), None, data, effects=SOME)
+    assert report.verdict in {"unknown", "named_partial", "ambiguous"}
+
+
+def test_same_seed_same_report():
+    data = logs(count=3)
+    first, second = (diagnose(system(), None, data, effects=SOME[:4]) for _ in range(2))
+    assert first.gap == second.gap
+    assert first.candidates == second.candidates
+
+
+def test_a_single_trajectory_is_never_a_confident_verdict():
+    data = logs(count=1, steps=400, push=lambda q, v: -0.15 * np.sign(v))
+    report = diagnose(system(), None, data, effects=SOME)
+    assert report.verdict != "named"
+    assert any("1 trajectories" in alarm for alarm in report.alarms)
+
+
+def test_the_report_is_json(tmp_path):
+    report = diagnose(system(), None, logs(count=3), effects=SOME[:3])
+    assert isinstance(report, Report)
+    report.to_json(tmp_path / "report.json")
+    text = (tmp_path / "report.json").read_text(encoding="utf-8")
+    assert '"schema": 1' in text
+    assert "NaN" not in text
+
+
+def test_no_logs_are_refused():
+    with pytest.raises(ValueError, match="expected logs"):
+        diagnose(system(), None, [])
+
+
+def test_logs_shorter_than_a_segment_are_refused():
+    with pytest.raises(ValueError, match="more than 50 rows"):
+        diagnose(system(), None, logs(count=3, steps=4), horizon=50, effects=SOME[:2])
+
+
+def test_unknown_effects_are_refused():
+    with pytest.raises(KeyError, match="coulomb_friction"):
+        diagnose(system(), None, logs(count=3, steps=40), effects=["coulomb_fricton"])
