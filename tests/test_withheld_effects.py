@@ -246,6 +246,34 @@ def test_detectability_is_nothing_without_a_cause_and_grows_with_it():
     assert some.detectability > 100
 
 
+def test_a_sensor_of_velocities_has_velocities_logged_and_a_withheld_case_a_list():
+    from withheld.cases import Plan, make
+
+    for seed in range(3):
+        plan = Plan("T3", "arm", ("sensor_gain",))
+        case = make(plan, np.random.default_rng(seed))
+        assert case.velocities
+        assert "sensor_gain" not in case.effects
+        assert "coulomb_friction" in case.effects
+
+
+def test_of_two_causes_both_act():
+    from withheld.cases import Plan, make
+
+    def chain(*names):
+        case = make(Plan("T5", "arm", names), np.random.default_rng(1))
+        return [truth.name for truth in case.truths]
+
+    assert chain("backlash", "action_bias") == ["action_bias", "backlash"]
+    assert chain("action_bias", "action_delay") == ["action_delay", "action_bias"]
+    from withheld import causes_actuation as actuation
+
+    rotor, pushed = actuation.backlash(site("other"))[0], actuation.bias(site())[0]
+    plain, both = run(rotor, commands=0.0), run(pushed, rotor, commands=0.0)
+    assert np.abs(plain.clean).max() < 1e-9
+    assert np.abs(both.clean[:, 0]).max() > 1e-3
+
+
 def test_wilson_intervals():
     from withheld.scoring import wilson
 

@@ -27,6 +27,7 @@ CAUSES = ACTUATION | BODY | CONTACT | SENSING | FOREIGN
 # What no data can tell from a parameter: the prior then is over the others.
 _LIKE_MASSES = {"action_gain", "payload", "armature", "com_shift", "link_length"}
 _LIKE_DAMPINGS = {"viscous_friction"}
+_OF_VELOCITIES = {"sensor_gain", "sensor_lag"}  # they act on velocities, so those are logged
 
 
 @dataclass(frozen=True)
@@ -100,14 +101,15 @@ def _make(plan: Plan, rng: np.random.Generator) -> Case:
         share = rng.uniform(0.1, 0.9) if plan.control != "parameters" else rng.choice([0.03, 0.97])
         theta[entry] = low + (high - low) * float(share)
         write_entry(nominal, entry, theta[entry])
-    made = [_cause(name, plan.form, model=nominal, robot=robot, rng=rng) for name in plan.causes]
+    order = sorted(plan.causes, key=_place_in_chain)
+    made = [_cause(name, plan.form, model=nominal, robot=robot, rng=rng) for name in order]
     nv = nominal.nv
     noise = np.repeat([_log(rng, 1e-3, 3e-3), _log(rng, 1e-2, 3e-2)], nv)
     plant = Plant(
         _true_model(nominal, robot, plan.engine), robot.control_dt, [c for c, _ in made], noise, rng
     )
     loops = str(rng.choice(["open", "open", "closed", "mixed"]))
-    velocities = bool(rng.random() < 0.75)
+    velocities = bool(rng.random() < 0.75) or bool(_OF_VELOCITIES & set(plan.causes))
     told = noise if rng.random() < 0.5 else None
     if plan.control == "noise":
         told, plant.noise = noise, 2.0 * noise
@@ -128,6 +130,11 @@ def _make(plan: Plan, rng: np.random.Generator) -> Case:
         motions=tuple(motions), unseen=tuple(unseen), noise=told, velocities=velocities,
         effects=withheld, detectability=visible, excitation=loops,
     )  # fmt: skip
+
+
+def _place_in_chain(name: str) -> int:
+    """Return 0 for what delays the logged command, 2 for what hands it to a rotor, else 1."""
+    return 0 if name == "action_delay" else 2 if name in {"backlash", "series_elasticity"} else 1
 
 
 def _log(rng: np.random.Generator, low: float, high: float) -> float:

@@ -25,6 +25,7 @@ from .plant import Motion
 from .robots import entry_value, write_entry
 
 Array = NDArray[np.float64]
+_UNKNOWN = 100.0  # 1/s, noise of a velocity that is not measured per noise of its position
 
 
 def detectability(
@@ -62,7 +63,7 @@ def detectability(
         return _rollout(model, first, u, substeps)[..., measured]
 
     base = predict(x)
-    first_noise = np.where(measured, noise, 5.0 * np.resize(noise[: width // 2], width))
+    first_noise = np.where(measured, noise, _UNKNOWN * np.resize(noise[: width // 2], width))
     columns = []
     for i in range(width):
         step = first_noise[i] * np.eye(width)[i]

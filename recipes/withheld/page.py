@@ -60,7 +60,7 @@ def failed(one: Record) -> bool:
     """Return whether a case counts against the diagnosis."""
     if one["verdict"] == "crash":
         return True
-    if one["tier"] in {"T3", "T4", "shuffled"}:
+    if one["tier"] in {"T3", "T4", "shuffled"} or (one["tier"] == "T6" and not one["truth"]):
         return one["verdict"] == "named"
     if not one["truth"]:
         return one["verdict"] not in {"none", "not_testable"}

@@ -75,7 +75,7 @@ def _pair(robot: str, rng: np.random.Generator) -> Plan:
     deck = applicable(robot, form)
     while True:
         a, b = (str(name) for name in rng.choice(deck, 2, replace=False))
-        apart = class_of(a) != class_of(b)
+        apart = class_of(a) != class_of(b) and not {a, b} <= _OTHER_ONLY
         if apart and not ("viscous_friction" in {a, b} and _divides({a, b})):
             return Plan("T5", robot, (a, b), form)
 

@@ -67,7 +67,7 @@ def record(
         "named": named, "named_class": [class_of(name) for name in named],
         "confusion_set": confused, "seconds": report["seconds"],
         "explained": (report.get("gap") or {}).get("explained_fraction"),
-        "p_value": effects[0]["p_value"] if effects else None,
+        "p_value": min((c["p_value"] for c in report.get("candidates", ())), default=None),
     }  # fmt: skip
     if shrinks is not None and report["verdict"] in _NAMING:
         gap = report["gap"]
@@ -164,7 +164,9 @@ def _tier(tier: str, every: Sequence[Record], visible: Sequence[Record]) -> dict
     seen = [r for r in visible if r["tier"] == tier]
     alarm: Callable[[Record], bool] = lambda r: r["verdict"] not in {"none", "not_testable"}
     if tier in {"T0", "parameters", "noise"}:
-        return {"n": len(mine), "false_alarm": share(alarm(r) for r in mine)}
+        low = share(r["p_value"] < 0.05 for r in mine if r["p_value"] is not None)
+        alarms = share(alarm(r) for r in mine)
+        return {"n": len(mine), "false_alarm": alarms, "p_below_5_percent": low}
     if tier == "shuffled":
         return {"n": len(mine), "wrong_named": share(r["verdict"] == "named" for r in mine)}
     if tier in {"T3", "T4"}:
@@ -189,7 +191,8 @@ def _tier(tier: str, every: Sequence[Record], visible: Sequence[Record]) -> dict
     }
     if tier == "T6":
         none = [r for r in mine if not r["truth"]]
-        result["none"] = {"n": len(none), "false_alarm": share(alarm(r) for r in none)}
+        # another integrator or contact model is a gap that may be seen; it has no name
+        result["none_wrong_named"] = share(r["verdict"] == "named" for r in none)
     return result
 
 
