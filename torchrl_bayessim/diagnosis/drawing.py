@@ -183,7 +183,7 @@ class _Frame:
 
     def y(self, value: float) -> float:
         low, high = self._y
-        share = min(max((value - low) / max(high - low, 1e-300), -0.2), 1.2)
+        share = min(max((value - low) / max(high - low, 1e-300), -0.04), 1.04)
         return _HEIGHT - _BOTTOM - (_HEIGHT - _BOTTOM - _TOP) * share
 
     def axes(self, title: str, x: str) -> list[Markup]:

@@ -124,16 +124,15 @@ def _signature(prepared: Prepared, selection: Selection) -> dict[str, Any]:
     A force is nearly constant over a few steps only, so training segments are cut into short ones.
     """
     train, robot = prepared.sets["train"], prepared.predictor.system.robot
+    pushes = [u for u in units_of([effect("constant_force")], robot) if u.where in robot.joints]
+    if not pushes:
+        return {}
     before_fit, after_fit = selection.nominal.fit, selection.best.fit
     short = _shortened(train.segments)
-    theta = train.theta(before_fit.point.z)
-    white = whitening(prepared.predictor, short, theta, prepared.noise)
+    white = whitening(prepared.predictor, short, train.theta(before_fit.point.z), prepared.noise)
     train = Objective(prepared.predictor, train.prior, short, white)
     one, two = train([before_fit.point, after_fit.point])
-    pushes = [u for u in units_of([effect("constant_force")], robot) if u.where in robot.joints]
     before = signature_curves(train, replace(before_fit, innovations=one), pushes)
-    if not before:
-        return {}
     joint = _joint(selection.best.units, robot) or max(before, key=lambda j: _variance(before[j]))
     curves = {"before": before[joint]}
     if selection.best.units:

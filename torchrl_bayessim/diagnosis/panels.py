@@ -61,20 +61,22 @@ def size(report: Report) -> Markup:
             f" The effects explain {percent(gap.explained_fraction)} of what fitting leaves above "
             f"the floor, interval {percent(low)} to {percent(high)}."
         )
-    return joined(
-        [element("p", told), grid([waterfall(steps)], "grid wide"), _rollouts(gap.rollout_rmse)]
-    )
+    bars = grid([waterfall(steps)], "grid wide")
+    return joined([element("p", told), bars, _rollouts(report)])
 
 
-def _rollouts(errors: Mapping[str, Mapping[str, float]]) -> Markup | None:
+def _rollouts(report: Report) -> Markup | None:
+    errors = report.gap.rollout_rmse
     before, after = errors.get("refit", {}), errors.get("with_effects", {})
     if not before:
         return None
+    head = ["output", "parameters fitted", "with effects", "ratio"]
     rows = [
         [name, number(error), number(after.get(name)), ratio(error, after.get(name))]
         for name, error in before.items()
     ]
-    head = ["output", "parameters fitted", "with effects", "ratio"]
+    if not report.effects:
+        head, rows = head[:2], [row[:2] for row in rows]
     return table("Open-loop error over whole test runs, root mean square, SI units", head, rows)
 
 
@@ -92,14 +94,14 @@ def _shares_of(where: Mapping[str, Any], title: str) -> Markup:
         {"name": name, "share": share} for name, share in dict(where.get("channel", {})).items()
     ]
     quarters = [
-        {"name": f"{number(q['t0'])} to {number(q['t1'])} s", "share": q["share"]}
+        {"name": f"{number(q['t0'])} to {number(q['t1'])}", "share": q["share"]}
         for q in where.get("time", ())
     ]
     groups = {
         "part of the robot": channels,
         "joint": where.get("joints", ()),
         "output": where.get("outputs", ()),
-        "time": quarters,
+        "time, s": quarters,
     }
     tables = [
         table(f"Share by {name}", [name, "share"],
