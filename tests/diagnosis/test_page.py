@@ -191,7 +191,7 @@ def test_the_waterfall_accounts_for_all_of_the_gap():
     (label,) = (a["aria-label"] for tag, a in Outline(page(report())).tags
                 if tag == "svg" and "innovation" in a["aria-label"])  # fmt: skip
     assert label == (
-        "Mean squared innovation. simulator as described: 5.1; credit to parameters: -2; "
+        "Mean squared innovation. at the prior's mean: 5.1; credit to parameters: -2; "
         "parameters fitted: 3.1; credit to coulomb friction at hinge: -1.8; with effects: 1.3; "
         "perfect simulator: noise: 1"
     )

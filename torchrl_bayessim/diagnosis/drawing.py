@@ -71,7 +71,7 @@ def waterfall(steps: Sequence[Step]) -> Markup:
     """Return horizontal bars, one below the other, with intervals as whiskers."""
     bounds = [v for s in steps for v in (s.begin, s.end, *(s.interval or ())) if math.isfinite(v)]
     high = max([1e-12, *bounds])
-    scale = (_WIDTH - 2 * _RIGHT - 62) / high
+    scale = (_WIDTH - 2 * _RIGHT - 74) / high
     parts = []
 
     def place(value: float) -> float:

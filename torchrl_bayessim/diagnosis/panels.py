@@ -37,7 +37,7 @@ def size(report: Report) -> Markup:
     """Return how large the gap is, and who is credited with what of it."""
     gap, intervals = report.gap, report.figures.get("waterfall", {})
     steps = [
-        Step("simulator as described", 0.0, gap.raw, "total"),
+        Step("at the prior's mean", 0.0, gap.raw, "total"),
         Step("credit to parameters", gap.raw, gap.refit, "parameters"),
         Step("parameters fitted", 0.0, gap.refit, "total", intervals.get("refit")),
     ]
@@ -82,7 +82,10 @@ def _rollouts(report: Report) -> Markup | None:
 
 def place(report: Report) -> Markup:
     """Return where the error sits, before the effects and after."""
-    parts: list[object] = [_shares_of(report.where, "Before the effects")]
+    title = "Before the effects" if report.effects else "The error"
+    parts: list[object] = [_shares_of(report.where, title)]
+    if report.verdict == "none":
+        parts.insert(0, element("p", "No gap was found: what follows is mostly noise."))
     if report.effects:
         parts.append(_shares_of(report.remainder, "What remains after the effects"))
     return joined([_heat(report.figures.get("heat", {})), *parts])
