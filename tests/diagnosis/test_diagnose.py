@@ -111,6 +111,19 @@ def test_dry_friction_is_named_and_measured():
     assert report.where["channel"]["body"] == 1.0
 
 
+def test_the_frequency_of_a_disturbance_is_found():
+    clock = iter(np.tile(0.0005 * np.arange(200 * 5 * FINER), 6))
+
+    def push(q, v):
+        return 0.3 * np.sin(2 * np.pi * 1.7 * next(clock) + 0.5)
+
+    report = diagnose(system(), None, logs(push=push), effects=(*SOME, "periodic_disturbance"))
+    assert report.effects[0].name == "periodic_disturbance"
+    assert report.effects[0].strength == pytest.approx(0.3, rel=0.15)
+    effect = next(iter(report.strengths))
+    assert effect.frequency == pytest.approx(1.7, abs=0.1)
+
+
 def test_a_late_command_is_named_with_what_it_cannot_be_told_from():
     report = diagnose(system(), None, logs(act=lambda u, k: u[max(0, k - 2)]), effects=SOME)
     assert {"action_delay", "sensor_delay"} & set(report.confusion_set)

@@ -21,10 +21,11 @@ from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
 from ..physics.mujoco import MujocoPhysics
 from .evidence import assemble
-from .objective import units_of
-from .preparation import prepare
+from .objective import Unit, units_of
+from .preparation import Prepared, prepare, split
 from .report import Report
 from .selection import select
+from .shapes import shaped
 
 _ALPHA = 0.01
 
@@ -66,6 +67,7 @@ def diagnose(
     with threadpool_limits(1, user_api="blas"):
         progress("fitting the parameters")
         prepared = prepare(system, logs, units, generator=generator, horizon=horizon)
+        units = _with_shapes(system, logs, prepared, units)
         selection = select(
             prepared.sets["train"],
             prepared.sets["validation"],
@@ -86,6 +88,26 @@ def diagnose(
             begun=begun,
             alpha=_ALPHA,
         )
+
+
+def _with_shapes(
+    system: System, logs: Sequence[Log], prepared: Prepared, units: list[Unit]
+) -> list[Unit]:
+    """Return the units, with frequencies and phases that the data suggest."""
+    names = {unit.name for unit in units} & {"periodic_disturbance", "cogging"}
+    if not names:
+        return units
+    pushes = units_of([effect("constant_force")], system.robot)
+    found = shaped(
+        prepared.predictor,
+        split(logs)["train"],
+        z=prepared.nominal.point.z,
+        noise=prepared.noise,
+        pushes=[u for u in pushes if u.where != "all"],
+    )
+    found = [unit for unit in found if unit.name in names]
+    better = {(unit.name, unit.where) for unit in found}
+    return [u for u in units if (u.name, u.where) not in better] + found
 
 
 def _system(simulator: str | Task | System, prior: BoxPrior | None) -> System:

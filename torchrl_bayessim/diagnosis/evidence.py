@@ -13,10 +13,13 @@ from numpy.typing import NDArray
 
 from ..effects.effect import Effect
 from ..effects.robot import Robot
+from ..effects.units import unit_at
 from ..logs.log import Log
 from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
 from .confusion import confusion_set
+from .divergence import divergence_alarms
+from .figures import figures
 from .location import location
 from .objective import Objective, Point, Unit, strengths_of
 from .preparation import Prepared
@@ -71,7 +74,7 @@ def assemble(
         prepared, system, logs, {"refit": nominal.fit.point, "with_effects": best.fit.point}
     )
     candidates = _candidates(selection, confused, alpha)
-    effects = _effects(selection, credit, measured)
+    effects = _effects(selection, credit, measured, system.robot)
     gap = Gap(
         horizon_steps=prepared.horizon,
         raw=measured.raw,
@@ -84,6 +87,10 @@ def assemble(
         rollout_rmse=rollouts,
     )
     where, remainder = _locations(prepared, selection, credit)
+    points = {"as described": zero, "with fitted parameters": nominal.fit.point}
+    if best.units:
+        points["with the effects"] = best.fit.point
+    alarms += divergence_alarms(test, points)
     verdict, summary, more = conclude(
         system,
         prepared,
@@ -117,6 +124,7 @@ def assemble(
             "seconds": time.perf_counter() - begun,
         },
         strengths=_by_target(best.fit.point, system.robot),
+        figures=figures(prepared, selection, measured),
     )
 
 
@@ -159,7 +167,7 @@ def _strength_errors(fit: Fit, dispersion: float, size: int) -> dict[Unit, float
 
 
 def _effects(
-    selection: Selection, credit: Mapping[str, float], measured: Shrinkage
+    selection: Selection, credit: Mapping[str, float], measured: Shrinkage, robot: Robot
 ) -> tuple[Finding, ...]:
     """Return the effects of the best model, units of one effect together."""
     best = selection.best
@@ -174,9 +182,9 @@ def _effects(
         found.append(
             Finding(
                 name=name,
-                where=units[0].where if len(units) == 1 else "all",
+                where=units[0].where if len({u.where for u in units}) == 1 else "all",
                 strength=mean,
-                unit=units[0].effect.unit,
+                unit=unit_at(units[0].effect, robot, int(np.argmax(units[0].direction))),
                 ci95=(mean - 1.96 * error, mean + 1.96 * error),
                 p_value=selection.p_values[0],
                 share_of_gap=max(0.0, credit.get(name, 0.0) * measured.explained),

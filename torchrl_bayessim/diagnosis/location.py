@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-__all__ = ["location", "signature_curves"]
+__all__ = ["location", "missing_force", "signature_curves"]
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -123,18 +123,8 @@ def signature_curves(objective: Objective, fit: Fit, pushes: list[Unit]) -> dict
     """
     if not pushes:
         return {}
-    sizes = [0.05 * unit.high for unit in pushes]
-    points = [
-        Point(fit.point.z, {**fit.point.strengths, u: s})
-        for u, s in zip(pushes, sizes, strict=True)
-    ]
-    changed = objective(points)
-    slopes = (changed - fit.innovations) / np.array(sizes)[:, None, None]
+    force = missing_force(objective, fit.point, pushes)
     segments, robot = objective.segments, objective.predictor.system.robot
-    normal = np.einsum("ism,jsm->sij", slopes, slopes)
-    normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(len(pushes))
-    right = -np.einsum("ism,sm->si", slopes, fit.innovations)
-    force = np.linalg.solve(normal + 1e-12 * np.eye(len(pushes)), right[..., None])[..., 0]
     middle = segments.history + segments.horizon // 2
     curves: dict[str, Any] = {}
     for i, unit in enumerate(pushes):
@@ -151,3 +141,21 @@ def signature_curves(objective: Objective, fit: Fit, pushes: list[Unit]) -> dict
             name: {"x": x.tolist(), "force": force[:, i].tolist()} for name, x in against.items()
         }
     return curves
+
+
+def missing_force(objective: Objective, point: Point, pushes: Sequence[Unit]) -> Array:
+    """Return the constant forces that explain most of each segment's residual, shape ``(S, J)``.
+
+    Args:
+        objective: Segments and whitening.
+        point: What is in the model already.
+        pushes: A constant force at each of ``J`` joints.
+    """
+    sizes = [0.05 * unit.high for unit in pushes]
+    points = [Point(point.z, {**point.strengths, u: s}) for u, s in zip(pushes, sizes, strict=True)]
+    innovations, *changed = objective([point, *points])
+    slopes = (np.stack(changed) - innovations) / np.array(sizes)[:, None, None]
+    normal = np.einsum("ism,jsm->sij", slopes, slopes)
+    ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12
+    right = -np.einsum("ism,sm->si", slopes, innovations)
+    return np.linalg.solve(normal + ridge * np.eye(len(pushes)), right[..., None])[..., 0]

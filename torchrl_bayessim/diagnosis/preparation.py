@@ -157,6 +157,13 @@ def _start(system: System) -> Array:
     return np.zeros(1 + (0 if system.prior is None else len(system.prior.names)))
 
 
+def _coordinates(predictor: Predictor, log: Log) -> Array:
+    """Return the measured channels as tangent coordinates seen from the first row, ``(T, C)``."""
+    qpos = log.qpos.numpy()
+    both = [predictor.tangent.difference(qpos[:1], qpos), log.qvel.numpy()]
+    return np.concatenate(both, -1)[:, list(predictor.system.channel_index)]
+
+
 def _noise(
     system: System,
     predictor: Predictor,
@@ -166,7 +173,7 @@ def _noise(
     alarms: list[str],
 ) -> tuple[Array, str]:
     """Return each channel's noise: the differences of innovations, checked by the sensor's spec."""
-    values = [predictor.values(log.qpos.numpy(), log.qvel.numpy()) for log in logs]
+    values = [_coordinates(predictor, log) for log in logs]
     smooth = noise_from_differences(logs, values)
     channels = system.robot.channels
     given = np.array([system.noise.get(name, np.nan) for name in channels])

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from ..effects.effect import ForceEffect
+from .additions import groups, pairs, singles
 from .objective import Objective, Point, Unit
 from .refit import Fit, fit_on, refit
 from .screening import Screen, screen
@@ -31,7 +31,7 @@ _SHARE = 0.1  # of the gap: what an effect that could be another must remove to 
 _REST = 0.5  # of what the base leaves: what any further effect must remove
 _WRONG = 1.5  # mean squared innovation of a base that something is missing from
 _MOST = 4  # effects in one explanation
-_RIVALS, _PAIRS, _GROUPS = 6, 4, 3  # models refitted: in an effect's place, pairs, several targets
+_RIVALS = 6  # models with another effect in the place of one
 _SURVIVORS = 7  # models of a round that are fitted to the end
 _MANY, _APART, _MATTER = 150, 4, 8  # units, targets of one effect, effects to look at singly
 _FEW = 8  # segments on which a round begins
@@ -186,7 +186,7 @@ def _explanations(
     middle = np.zeros_like(base.fit.point.z)
     far = not base.units and len(middle) and (base.fit.innovations**2).mean() > _BENT
     starts = []
-    for on in [*_singles(seen), *_best_pairs(seen), *_groups(seen)]:
+    for on in [*singles(seen), *pairs(seen), *groups(seen)]:
         starts.append(Point(base.fit.point.z, {**base.fit.point.strengths, **on}))
         if len(on) == 1 and far:
             unit, strength = next(iter(on.items()))
@@ -211,81 +211,6 @@ def _fittest(fits: Sequence[Fit]) -> list[Fit]:
         if len(kept) == _SURVIVORS:
             break
     return kept
-
-
-def _singles(seen: Screen) -> list[dict[Unit, float]]:
-    """Return each effect at its best place, and at all of its targets together."""
-    best = seen.best(1.0)
-    order = sorted(best, key=lambda unit: -best[unit][0])
-    chosen: dict[tuple[str, bool], Unit] = {}
-    for unit in order:
-        if best[unit][0] > 2.0:
-            chosen.setdefault((unit.name, unit.where == "all"), unit)
-    return [{unit: best[unit][1]} for unit in chosen.values()]
-
-
-def _best_pairs(seen: Screen) -> list[dict[Unit, float]]:
-    """Return the pairs of different effects that explain most together."""
-    usable = np.flatnonzero(seen.norms > 0)
-    scores, norms = seen.scores[usable], seen.norms[usable]
-    cosine = seen.correlation[np.ix_(usable, usable)]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1 / (1 - cosine**2)
-        first = (scores[:, None] - cosine * scores[None]) * inverse
-        second = first.T
-        gain = first * scores[:, None] + second * scores[None]
-    names = np.array([seen.units[i].name for i in usable])
-    alike = names[:, None] == names[None]
-    gain[(first <= 0) | (second <= 0) | (np.abs(cosine) > 0.98) | alike] = -np.inf
-    gain[np.tril_indices(len(gain))] = -np.inf
-    found: list[dict[Unit, float]] = []
-    taken: set[frozenset[Unit]] = set()
-    for flat in np.argsort(-gain, axis=None)[:400]:
-        i, j = np.unravel_index(flat, gain.shape)
-        if not np.isfinite(gain[i, j]) or len(found) == _PAIRS:
-            break
-        key = frozenset({seen.units[usable[i]], seen.units[usable[j]]})
-        if key not in taken:
-            taken.add(key)
-            amplitudes = first[i, j] / norms[i], second[i, j] / norms[j]
-            found.append({
-                seen.units[usable[n]]: _inside(
-                    seen.units[usable[n]], float(np.clip(a, 0.1, 10) * seen.strengths[usable[n]])
-                )
-                for n, a in zip((i, j), amplitudes, strict=True)
-            })  # fmt: skip
-    return found
-
-
-def _groups(seen: Screen) -> list[dict[Unit, float]]:
-    """Return each effect at several of its targets, strengths of their own by non-negative fits."""
-    found = []
-    for name in dict.fromkeys(unit.name for unit in seen.units):
-        best: dict[Unit, int] = {}
-        for i, unit in enumerate(seen.units):
-            if unit.name == name and unit.where != "all" and seen.norms[i] > 0:
-                known = best.get(unit)
-                best[unit] = i if known is None or seen.scores[i] > seen.scores[known] else known
-        if len(best) < 2:
-            continue
-        rows = list(best.values())
-        values, vectors = np.linalg.eigh(seen.correlation[np.ix_(rows, rows)])
-        root = np.sqrt(np.maximum(values, 1e-6))
-        scores = seen.scores[rows]
-        amplitude, _ = nnls((vectors * root).T, vectors.T @ scores / root)
-        on = {
-            unit: _inside(unit, float(a / seen.norms[i] * seen.strengths[i]))
-            for (unit, i), a in zip(best.items(), amplitude, strict=True)
-            if a > 0
-        }
-        if len(on) > 1:
-            found.append((float(amplitude @ scores) - 4 * len(on), on))
-    found.sort(key=lambda pair: -pair[0])
-    return [on for _, on in found[:_GROUPS]]
-
-
-def _inside(unit: Unit, strength: float) -> float:
-    return float(np.clip(strength, 2 * unit.low, 2 * unit.high))
 
 
 def _fitted(

@@ -160,7 +160,8 @@ def _ruled_out(candidates: Sequence[Candidate]) -> str:
     found: dict[str, str] = {}
     for c in candidates:
         if c.status == "ruled_out" and c.minimal_detectable_strength is not None:
-            text = f"{c.name} above {c.minimal_detectable_strength:.2g} {_unit(c)}".rstrip()
+            name, least = c.name.replace("_", " "), c.minimal_detectable_strength
+            text = f"{name} above {least:.2g} {_unit(c)}"
             found.setdefault(c.name, text)
     some = list(found.values())[:4]
     more = f" and {len(found) - 4} more" if len(found) > 4 else ""

@@ -1,0 +1,91 @@
+"""What may be added to an explanation: single units, pairs, one effect at several targets.
+
+All from the correlations of a screen, without a simulation.
+"""
+
+from __future__ import annotations
+
+__all__ = ["groups", "pairs", "singles"]
+
+import numpy as np
+from scipy.optimize import nnls
+
+from .objective import Unit
+from .screening import Screen
+
+_PAIRS, _GROUPS = 4, 3  # at most
+
+
+def singles(seen: Screen) -> list[dict[Unit, float]]:
+    """Return each effect at its best place, and at all of its targets together."""
+    best = seen.best(1.0)
+    order = sorted(best, key=lambda unit: -best[unit][0])
+    chosen: dict[tuple[str, bool], Unit] = {}
+    for unit in order:
+        if best[unit][0] > 2.0:
+            chosen.setdefault((unit.name, unit.where == "all"), unit)
+    return [{unit: best[unit][1]} for unit in chosen.values()]
+
+
+def pairs(seen: Screen) -> list[dict[Unit, float]]:
+    """Return the pairs of different effects that explain most together."""
+    usable = np.flatnonzero(seen.norms > 0)
+    scores, norms = seen.scores[usable], seen.norms[usable]
+    cosine = seen.correlation[np.ix_(usable, usable)]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1 / (1 - cosine**2)
+        first = (scores[:, None] - cosine * scores[None]) * inverse
+        second = first.T
+        gain = first * scores[:, None] + second * scores[None]
+    names = np.array([seen.units[i].name for i in usable])
+    alike = names[:, None] == names[None]
+    gain[(first <= 0) | (second <= 0) | (np.abs(cosine) > 0.98) | alike] = -np.inf
+    gain[np.tril_indices(len(gain))] = -np.inf
+    found: list[dict[Unit, float]] = []
+    taken: set[frozenset[Unit]] = set()
+    for flat in np.argsort(-gain, axis=None)[:400]:
+        i, j = np.unravel_index(flat, gain.shape)
+        if not np.isfinite(gain[i, j]) or len(found) == _PAIRS:
+            break
+        key = frozenset({seen.units[usable[i]], seen.units[usable[j]]})
+        if key not in taken:
+            taken.add(key)
+            amplitudes = first[i, j] / norms[i], second[i, j] / norms[j]
+            found.append({
+                seen.units[usable[n]]: _inside(
+                    seen.units[usable[n]], float(np.clip(a, 0.1, 10) * seen.strengths[usable[n]])
+                )
+                for n, a in zip((i, j), amplitudes, strict=True)
+            })  # fmt: skip
+    return found
+
+
+def groups(seen: Screen) -> list[dict[Unit, float]]:
+    """Return each effect at several of its targets, strengths of their own by non-negative fits."""
+    found = []
+    for name in dict.fromkeys(unit.name for unit in seen.units):
+        best: dict[Unit, int] = {}
+        for i, unit in enumerate(seen.units):
+            if unit.name == name and unit.where != "all" and seen.norms[i] > 0:
+                known = best.get(unit)
+                best[unit] = i if known is None or seen.scores[i] > seen.scores[known] else known
+        if len(best) < 2:
+            continue
+        rows = list(best.values())
+        values, vectors = np.linalg.eigh(seen.correlation[np.ix_(rows, rows)])
+        root = np.sqrt(np.maximum(values, 1e-6))
+        scores = seen.scores[rows]
+        amplitude, _ = nnls((vectors * root).T, vectors.T @ scores / root)
+        on = {
+            unit: _inside(unit, float(a / seen.norms[i] * seen.strengths[i]))
+            for (unit, i), a in zip(best.items(), amplitude, strict=True)
+            if a > 0
+        }
+        if len(on) > 1:
+            found.append((float(amplitude @ scores) - 4 * len(on), on))
+    found.sort(key=lambda pair: -pair[0])
+    return [on for _, on in found[:_GROUPS]]
+
+
+def _inside(unit: Unit, strength: float) -> float:
+    return float(np.clip(strength, 2 * unit.low, 2 * unit.high))
