@@ -8,6 +8,13 @@ draws robots, causes, strengths, places, noise and excitation. Labels go to ``se
 whose SHA-256 is printed before the first diagnosis; the diagnosis is given a folder with
 ``system.yaml``, the nominal model and CSV files. When all reports are written, the labels are
 opened, checked against the sum, and the reports are scored, once.
+
+Tiers: T0 no cause; T1 a cause as the catalogue has it; T2 the same cause in another form; T3 one
+whose class is withheld from the catalogue; T4 a cause that no catalogue has; T5 two causes; T6 the
+robot in another engine (MuJoCo with another integrator, cone and solver); controls: parameters at
+the edge of the prior, twice the noise of the data sheet, actions shuffled between trajectories.
+Causes below ``threshold`` (see ``withheld/detectability.py``) cannot be seen by anyone, and are
+left out of the scores of T1 to T6; ``by_detectability`` has them.
 """
 
 from __future__ import annotations

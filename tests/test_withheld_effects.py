@@ -283,6 +283,40 @@ def test_wilson_intervals():
     assert wilson(0, 300)[1] == pytest.approx(0.0126, abs=1e-4)
 
 
+def test_a_wrong_name_counts_only_where_the_verdict_stands_by_it():
+    from withheld.scoring import record, scores
+
+    place = {"joint": "hinge", "channel": "body", "strength": {"N m": 0.2}}
+    label = {
+        "tier": "T3", "robot": "arm", "form": "same", "engine": "fine", "detectability": 500.0,
+        "excitation": "open", "velocities": True, "runs": 8, "noise_told": True,
+        "truths": [{"name": "coulomb_friction", **place}],
+    }  # fmt: skip
+    found = {
+        "name": "viscous_friction", "where": "hinge", "strength": 0.25, "unit": "N m",
+        "ci95": [0.1, 0.3], "strengths": {"hinge": 0.25},
+    }  # fmt: skip
+    report = {
+        "effects": [found], "confusion_set": ["viscous_friction"], "seconds": 1.0,
+        "gap": {"explained_fraction": 0.9, "ci95": [0.8, 0.95]},
+    }  # fmt: skip
+    wrong = record(label, report | {"verdict": "named"}, 0.7)
+    unsure = record(label, report | {"verdict": "unknown"}, 0.7)
+    result = scores([wrong, unsure], threshold=100.0)
+    assert result["tiers"]["T3"]["wrong_named"]["value"] == 0.5
+    assert result["shrinkage"]["mae"] == pytest.approx(0.2)
+    assert result["shrinkage"]["ci_cover"]["value"] == 0.0
+    assert wrong["top1_class"]
+    assert not wrong["top1"]
+    assert wrong["joint"]
+    assert not unsure["top1_class"]
+    right = found | {"name": "coulomb_friction"}
+    one = record(label | {"tier": "T1"}, report | {"verdict": "named", "effects": [right]})
+    assert one["top1"]
+    assert one["strength_error"] == pytest.approx(0.25)
+    assert one["strength_covered"]
+
+
 def test_no_name_is_in_two_classes_and_the_true_one_is_withheld():
     from withheld.classes import NAMES, class_of, without_class_of
 

@@ -40,7 +40,8 @@ class Plan:
         causes: Names of the causes.
         form: ``same`` as the catalogue's, or ``other``.
         engine: ``fine`` or ``other``: another integrator, cone and solver.
-        control: ``noise``, ``shuffled`` or nothing.
+        control: ``parameters`` at the edge of the prior, ``noise`` twice that of the data sheet,
+            actions ``shuffled`` between trajectories, or nothing.
     """
 
     tier: str

@@ -40,6 +40,8 @@ def table(result: Mapping[str, Any]) -> str:
     for robot, tiers in result["by_robot"].items():
         rows |= {f"{tier} {robot}": scores for tier, scores in tiers.items()}
     rows["where"] = result["where"]
+    rows["shrinkage"] = result["shrinkage"]
+    rows["strength"] = result["strength"]
     return _lines(rows)
 
 
@@ -51,7 +53,7 @@ def _lines(rows: Mapping[str, Mapping[str, Any]]) -> str:
                 low, high = value["ci95"]
                 text = f"{value['value']:.2f} | {low:.2f} to {high:.2f} | {value['n']}"
                 lines.append(f"| {name} | {score} | {text} |")
-            elif score == "set_size" and value is not None:
+            elif score in {"set_size", "mae", "median_error"} and value is not None:
                 lines.append(f"| {name} | {score} | {value:.2f} | | {scores['n']} |")
     return "\n".join(lines)
 

@@ -55,7 +55,8 @@ def record(
         shrinks: True share of the gap that the named effects remove.
     """
     truths = label["truths"]
-    effects = report.get("effects", [])
+    # a verdict that explains nothing names nothing, whatever was tried
+    effects = report.get("effects", []) if report["verdict"] in _NAMING else []
     named = [effect["name"] for effect in effects]
     confused = report.get("confusion_set", [])
     true = [truth["name"] for truth in truths]
@@ -66,7 +67,6 @@ def record(
         "verdict": report["verdict"], "summary": report.get("summary", ""),
         "named": named, "named_class": [class_of(name) for name in named],
         "confusion_set": confused, "seconds": report["seconds"],
-        "explained": (report.get("gap") or {}).get("explained_fraction"),
         "p_value": min((c["p_value"] for c in report.get("candidates", ())), default=None),
     }  # fmt: skip
     if shrinks is not None and report["verdict"] in _NAMING:
