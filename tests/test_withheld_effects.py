@@ -274,6 +274,14 @@ def test_of_two_causes_both_act():
     assert np.abs(both.clean[:, 0]).max() > 1e-3
 
 
+def test_a_label_knows_what_a_joint_its_motor_and_its_body_are_called():
+    from withheld.cases import Plan, make
+    from withheld.folders import label
+
+    case = make(Plan("T1", "cart_pole", ("dead_band",)), np.random.default_rng(0))
+    assert label(case)["truths"][0]["places"] == ["rail", "drive", "cart"]
+
+
 def test_wilson_intervals():
     from withheld.scoring import wilson
 
@@ -286,7 +294,9 @@ def test_wilson_intervals():
 def test_a_wrong_name_counts_only_where_the_verdict_stands_by_it():
     from withheld.scoring import record, scores
 
-    place = {"joint": "hinge", "channel": "body", "strength": {"N m": 0.2}}
+    place = {
+        "joint": "hinge", "channel": "body", "strength": {"N m": 0.2}, "places": ["hinge", "motor"]
+    }  # fmt: skip
     label = {
         "tier": "T3", "robot": "arm", "form": "same", "engine": "fine", "detectability": 500.0,
         "excitation": "open", "velocities": True, "runs": 8, "noise_told": True,

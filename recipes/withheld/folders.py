@@ -20,7 +20,7 @@ import yaml
 
 from .cases import Case
 from .plant import Motion
-from .robots import ROBOTS, nominal_model
+from .robots import ROBOTS, Robot, nominal_model
 
 
 def hand_over(case: Case, folder: Path) -> None:
@@ -79,7 +79,10 @@ def label(case: Case) -> dict[str, Any]:
     """Return what is true of a case."""
     return {
         **asdict(case.plan),
-        "truths": [asdict(truth) for truth in case.truths],
+        "truths": [
+            asdict(truth) | {"places": _places(ROBOTS[case.plan.robot], truth.joint)}
+            for truth in case.truths
+        ],
         "theta": case.theta,
         "detectability": case.detectability,
         "excitation": case.excitation,
@@ -88,6 +91,17 @@ def label(case: Case) -> dict[str, Any]:
         "steps": len(case.motions[0].ctrl),
         "noise_told": case.noise is not None,
     }
+
+
+def _places(robot: Robot, joint: str) -> list[str]:
+    """Return what a joint, its actuators and its body are called."""
+    if joint == "all":
+        return []
+    model = nominal_model(robot)
+    number = model.joint(joint).id
+    driven = [a for a in range(model.nu) if model.actuator_trnid[a, 0] == number]
+    actuators = [model.actuator(a).name or f"actuator{a}" for a in driven]
+    return [joint, *actuators, model.body(int(model.jnt_bodyid[number])).name]
 
 
 def digest(path: Path) -> str:

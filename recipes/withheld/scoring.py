@@ -97,7 +97,8 @@ def _single(
     if first is None:
         return one
     if truth["joint"] != "all" and one["top1_class"]:
-        one["joint"] = truth["joint"].split()[0] in _words(first["where"], first["strengths"])
+        place = _place(first["where"], first["strengths"])
+        one["joint"] = any(f"{place} ".startswith(f"{name} ") for name in truth["places"])
     channels = (report.get("where") or {}).get("channel") or {}
     if channels and truth["channel"] in _CHANNELS:
         one["channel"] = max(channels, key=lambda name: channels[name]) == truth["channel"]
@@ -109,12 +110,12 @@ def _single(
     return one
 
 
-def _words(where: str, strengths: Mapping[str, float]) -> set[str]:
-    """Return the words of the place with the largest strength; columns' prefixes cut off."""
+def _place(where: str, strengths: Mapping[str, float]) -> str:
+    """Return the place with the largest strength, a column's without its prefix."""
     place = where
     if where == "all" and strengths:
         place = max(strengths, key=lambda name: abs(strengths[name]))
-    return {word.removeprefix("q_").removeprefix("v_") for word in place.split()}
+    return place.removeprefix("q_").removeprefix("v_")
 
 
 def scores(records: Sequence[Record], *, threshold: float) -> dict[str, Any]:
