@@ -51,12 +51,15 @@ def pairs(seen: Screen) -> list[dict[Unit, float]]:
         if key not in taken:
             taken.add(key)
             amplitudes = first[i, j] / norms[i], second[i, j] / norms[j]
-            found.append({
-                seen.units[usable[n]]: _inside(
-                    seen.units[usable[n]], float(np.clip(a, 0.1, 10) * seen.strengths[usable[n]])
-                )
-                for n, a in zip((i, j), amplitudes, strict=True)
-            })  # fmt: skip
+            both = [(usable[i], amplitudes[0]), (usable[j], amplitudes[1])]
+            found.append(
+                {
+                    seen.units[n]: seen.units[n].inside(
+                        float(np.clip(a, 0.1, 10)) * seen.strengths[n]
+                    )
+                    for n, a in both
+                }
+            )
     return found
 
 
@@ -77,7 +80,7 @@ def groups(seen: Screen) -> list[dict[Unit, float]]:
         scores = seen.scores[rows]
         amplitude, _ = nnls((vectors * root).T, vectors.T @ scores / root)
         on = {
-            unit: _inside(unit, float(a / seen.norms[i] * seen.strengths[i]))
+            unit: unit.inside(float(a / seen.norms[i] * seen.strengths[i]))
             for (unit, i), a in zip(best.items(), amplitude, strict=True)
             if a > 0
         }
@@ -85,7 +88,3 @@ def groups(seen: Screen) -> list[dict[Unit, float]]:
             found.append((float(amplitude @ scores) - 4 * len(on), on))
     found.sort(key=lambda pair: -pair[0])
     return [on for _, on in found[:_GROUPS]]
-
-
-def _inside(unit: Unit, strength: float) -> float:
-    return float(np.clip(strength, 2 * unit.low, 2 * unit.high))

@@ -55,6 +55,14 @@ class Unit:
         """The effect's name."""
         return self.effect.name
 
+    def inside(self, strength: float) -> float:
+        """Return the strength within what a fit may try: twice the plausible range.
+
+        Fractions stay in it, since less than nothing of a friction is none that a simulator knows.
+        """
+        reach = 1.0 if self.effect.unit == "fraction" else 2.0
+        return float(np.clip(strength, reach * self.low, reach * self.high))
+
     def joint(self, robot: Robot) -> int:
         """Return the joint at which it acts, -1 where there is none or there are several."""
         targets = [i for i, part in enumerate(self.direction) if part]

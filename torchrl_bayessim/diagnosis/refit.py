@@ -154,8 +154,8 @@ def fit_on(objective: Objective, fit: Fit) -> Fit:
 def _bounds(objective: Objective, units: tuple[Unit, ...]) -> tuple[Array, Array]:
     """Return bounds of standardised parameters and relative strengths."""
     edge = np.sqrt(3.0) if isinstance(objective.prior, BoxPrior) else 4.0
-    low = [-edge] * objective.size + [2.0 * unit.low / unit.high for unit in units]
-    high = [edge] * objective.size + [2.0] * len(units)
+    low = [-edge] * objective.size + [u.inside(-np.inf) / u.high for u in units]
+    high = [edge] * objective.size + [u.inside(np.inf) / u.high for u in units]
     return np.array(low), np.array(high)
 
 

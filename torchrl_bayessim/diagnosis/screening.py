@@ -73,7 +73,7 @@ class Screen:
             if unit not in result or ratio > result[unit][0]:
                 amplitude = max(score, 0.0) / norm if norm > 0 else 0.0
                 scaled = float(np.clip(amplitude, 0.1, 10.0) * strength)
-                result[unit] = float(ratio), float(np.clip(scaled, 2 * unit.low, 2 * unit.high))
+                result[unit] = float(ratio), unit.inside(scaled)
         return result
 
     def null(self, draws: int, generator: np.random.Generator) -> Array:
