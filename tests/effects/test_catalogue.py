@@ -21,7 +21,7 @@ sensor_gain sensor_noise sensor_quantization sensor_lag sensor_drift sensor_drop
 """.split()  # noqa: SIM905
 GROUPS = {
     "timing", "friction", "gain", "offset", "elasticity", "inertia", "contact", "geometry",
-    "noise", "disturbance",
+    "noise", "disturbance", "dead zone",
 }  # fmt: skip
 every = pytest.mark.parametrize("name", NAMES)
 

@@ -55,7 +55,7 @@ def pairs(seen: Screen) -> list[dict[Unit, float]]:
             found.append(
                 {
                     seen.units[n]: seen.units[n].inside(
-                        float(np.clip(a, 0.1, 10)) * seen.strengths[n]
+                        float(np.clip(a, 0.1, 10) * seen.strengths[n])
                     )
                     for n, a in both
                 }

@@ -102,6 +102,8 @@ def assemble(
         where=where,
         alpha=alpha,
     )
+    if verdict in {"none", "unknown", "not_testable"}:
+        effects, confused = (), ()  # what little was tried is among the candidates
     return Report(
         verdict=verdict,
         summary=summary,
@@ -123,7 +125,7 @@ def assemble(
             "p_values": list(selection.p_values),
             "seconds": time.perf_counter() - begun,
         },
-        strengths=_by_target(best.fit.point, system.robot),
+        strengths=_by_target(best.fit.point, system.robot) if effects else {},
         figures=figures(prepared, selection, measured),
     )
 

@@ -68,10 +68,11 @@ def shrinkage(
     refits, after = resampled[1] / resampled[3], resampled[2] / resampled[3]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = (refits - after) / np.where(refits > 1.0, refits - 1.0, np.nan)
-    explained = (refit - effects) / (refit - 1.0) if refit > 1.0 else 0.0
+    # noise may leave less than its mean; more than all cannot be explained
+    explained = min((refit - effects) / (refit - 1.0), 1.0) if refit > 1.0 else 0.0
     return Shrinkage(
         raw, refit, effects, explained,
-        _interval(ratios), _interval(refits - 1.0), _interval(after - 1.0),
+        _interval(np.minimum(ratios, 1.0)), _interval(refits - 1.0), _interval(after - 1.0),
     )  # fmt: skip
 
 

@@ -67,7 +67,7 @@ class Effect(ABC):
             ``fraction``, ``command`` or ``channel`` for the command's or channel's own.
         group: Effects of one group act alike; where data cannot tell them apart they are reported
             together: ``timing``, ``friction``, ``gain``, ``offset``, ``elasticity``, ``inertia``,
-            ``contact``, ``geometry``, ``noise``, ``disturbance``.
+            ``contact``, ``geometry``, ``noise``, ``disturbance``, ``dead zone``.
         channel: Where it sits: ``sensing``, ``actuation``, ``body`` or ``contact``.
         random: Whether it changes the distribution of what is seen rather than its mean.
         memoryless: Whether the law depends on this step only, so that sequences are one call.
