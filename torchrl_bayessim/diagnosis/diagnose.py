@@ -21,8 +21,8 @@ from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
 from ..physics.mujoco import MujocoPhysics
 from .evidence import assemble
-from .objective import Unit, units_of
-from .preparation import Prepared, prepare, split
+from .objective import Unit, pushes_of, units_of
+from .preparation import Prepared, prepare
 from .report import Report
 from .selection import select
 from .shapes import shaped
@@ -67,7 +67,7 @@ def diagnose(
     with threadpool_limits(1, user_api="blas"):
         progress("fitting the parameters")
         prepared = prepare(system, logs, units, generator=generator, horizon=horizon)
-        units = _with_shapes(system, logs, prepared, units)
+        units = _with_shapes(system, prepared, units)
         selection = select(
             prepared.sets["train"],
             prepared.sets["validation"],
@@ -80,7 +80,6 @@ def diagnose(
         progress("opening the test runs")
         return assemble(
             system,
-            logs,
             prepared=prepared,
             selection=selection,
             findings=findings,
@@ -90,20 +89,17 @@ def diagnose(
         )
 
 
-def _with_shapes(
-    system: System, logs: Sequence[Log], prepared: Prepared, units: list[Unit]
-) -> list[Unit]:
+def _with_shapes(system: System, prepared: Prepared, units: list[Unit]) -> list[Unit]:
     """Return the units, with frequencies and phases that the data suggest."""
     names = {unit.name for unit in units} & {"periodic_disturbance", "cogging"}
     if not names:
         return units
-    pushes = units_of([effect("constant_force")], system.robot)
     found = shaped(
         prepared.predictor,
-        split(logs)["train"],
+        prepared.logs["train"],
         z=prepared.nominal.point.z,
         noise=prepared.noise,
-        pushes=[u for u in pushes if u.where != "all"],
+        pushes=pushes_of(system.robot),
     )
     found = [unit for unit in found if unit.name in names]
     better = {(unit.name, unit.where) for unit in found}

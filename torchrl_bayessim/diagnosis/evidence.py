@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from ..effects.effect import Effect
 from ..effects.robot import Robot
 from ..effects.units import unit_at
-from ..logs.log import Log
 from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
 from .confusion import confusion_set
@@ -36,7 +35,6 @@ Array = NDArray[np.float64]
 
 def assemble(
     system: System,
-    logs: Sequence[Log],
     *,
     prepared: Prepared,
     selection: Selection,
@@ -49,7 +47,6 @@ def assemble(
 
     Args:
         system: The robot.
-        logs: Its logs.
         prepared: Split, noise, horizon, nominal fit.
         selection: What the search found.
         findings: Of the sanity gate.
@@ -71,7 +68,7 @@ def assemble(
         for p in parameters if p.at_bound
     ]  # fmt: skip
     rollouts = rollout_errors(
-        prepared, system, logs, {"refit": nominal.fit.point, "with_effects": best.fit.point}
+        prepared, {"refit": nominal.fit.point, "with_effects": best.fit.point}
     )
     candidates = _candidates(selection, confused, alpha)
     effects = _effects(selection, credit, measured, system.robot)

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects.catalogue import effect
 from ..effects.robot import Robot
 from ..effects.units import unit_at
-from .location import signature_curves
-from .objective import Objective, Point, Unit, strengths_of, units_of
+from .location import excess, signature_curves
+from .objective import Objective, Point, Unit, pushes_of, strengths_of
 from .prediction import Predictor
 from .preparation import Prepared
 from .regimes import features
@@ -124,7 +123,7 @@ def _signature(prepared: Prepared, selection: Selection) -> dict[str, Any]:
     A force is nearly constant over a few steps only, so training segments are cut into short ones.
     """
     train, robot = prepared.sets["train"], prepared.predictor.system.robot
-    pushes = [u for u in units_of([effect("constant_force")], robot) if u.where in robot.joints]
+    pushes = pushes_of(robot)
     if not pushes:
         return {}
     before_fit, after_fit = selection.nominal.fit, selection.best.fit
@@ -210,15 +209,14 @@ def _heat(judged: Objective, point: Point) -> dict[str, Any]:
     equally many rows, and the feature is the one between whose quarters it varies most.
     """
     robot = judged.predictor.system.robot
-    residual = np.nan_to_num(judged.raw([point])[0], nan=np.inf) / judged.whitening.spread
-    excess = np.clip(residual, -1e3, 1e3) ** 2 - 1.0
+    beyond = excess(judged, judged.raw([point])[0])
     best: tuple[float, str, list[float], Array] | None = None
     for name, values in features(judged.segments, robot).items():
         cuts = np.unique(np.quantile(values, _QUARTERS))
         quarter = np.searchsorted(cuts, values, side="right")
         if len(np.unique(quarter)) <= len(cuts):
             continue
-        means = np.stack([excess[quarter == i].mean(0) for i in range(len(cuts) + 1)], 1)
+        means = np.stack([beyond[quarter == i].mean(0) for i in range(len(cuts) + 1)], 1)
         spread = float(means.mean(0).var())
         if best is None or spread > best[0]:
             best = spread, name, cuts.tolist(), means

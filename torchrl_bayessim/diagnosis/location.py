@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["location", "missing_force", "signature_curves"]
+__all__ = ["excess", "location", "missing_force", "signature_curves"]
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -36,11 +36,11 @@ def location(
             channels and joints than any projection can.
     """
     robot = judged[0].predictor.system.robot
-    excess = _excess(*judged)
-    by_output = np.maximum(excess.mean((0, 1)), 0.0)
+    beyond = excess(*judged)
+    by_output = np.maximum(beyond.mean((0, 1)), 0.0)
     rules = regimes(
-        (features(train[0].segments, robot), _excess(*train).mean(-1)),
-        (features(judged[0].segments, robot), excess.mean(-1)),
+        (features(train[0].segments, robot), excess(*train).mean(-1)),
+        (features(judged[0].segments, robot), beyond.mean(-1)),
     )
     gains = dict(found) or _gains(seen)
     channels: dict[str, float] = dict.fromkeys(_CHANNELS, 0.0)
@@ -56,13 +56,13 @@ def location(
         "outputs": _named(dict(zip(robot.channels, by_output.tolist(), strict=True))),
         "joints": _named(joints),
         "regimes": [{"rule": r.rule, "support": r.support, "share": r.share} for r in rules[:4]],
-        "time": _over_time(judged[0].segments.time[:, judged[0].segments.rows], excess.mean(-1)),
+        "time": _over_time(judged[0].segments.time[:, judged[0].segments.rows], beyond.mean(-1)),
     }
 
 
-def _excess(objective: Objective, residual: Array) -> Array:
+def excess(objective: Objective, residual: Array) -> Array:
     """Return squared residuals over what noise would leave, minus one, ``(S, K, C)``."""
-    scaled = np.clip(np.nan_to_num(residual, nan=1e3) / objective.whitening.spread, -1e3, 1e3)
+    scaled = np.clip(np.nan_to_num(residual, nan=np.inf) / objective.whitening.spread, -1e3, 1e3)
     return scaled**2 - 1.0
 
 

@@ -5,7 +5,7 @@ A *point* is a parameter vector in standardised units (the prior has mean 0 and 
 simulator's own, 1: exact), and strengths of some *units*, an effect at one of its targets each. Its
 cost is::
 
-    Σ_i w_i ‖L_i⁻¹ r_i(θ, s)‖² / φ + ‖z(θ)‖²,
+    Σ_i w_i ‖L_i⁻¹ r_i(θ, s)‖² + ‖z(θ)‖²,
 
 with the prior as regulariser: a posterior that was fitted to the same data without the effect has
 already absorbed it.
@@ -13,7 +13,7 @@ already absorbed it.
 
 from __future__ import annotations
 
-__all__ = ["Objective", "Point", "Unit", "parameters_at", "strengths_of", "units_of"]
+__all__ = ["Objective", "Point", "Unit", "parameters_at", "pushes_of", "strengths_of", "units_of"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..effects.disturbance import ConstantForce
 from ..effects.effect import Effect
 from ..effects.robot import Robot
 from ..inference.priors import Prior
@@ -92,6 +93,11 @@ def units_of(effects: Sequence[Effect], robot: Robot) -> list[Unit]:
             every = tuple(h / high[largest] for h in high)
             units.append(Unit(effect, "all", every, low[largest], high[largest]))
     return units
+
+
+def pushes_of(robot: Robot) -> list[Unit]:
+    """Return a constant force at each joint."""
+    return [unit for unit in units_of([ConstantForce()], robot) if unit.where != "all"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,11 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects.catalogue import effect
 from ..errors import message
 from ..logs.log import Log
 from ..logs.system import System
-from .objective import Objective, Point, Unit, parameters_at, units_of
+from .objective import Objective, Point, Unit, parameters_at, pushes_of
 from .prediction import Predictor
 from .refit import Fit, refit
 from .segments import Segments, cut
@@ -42,7 +41,7 @@ class Prepared:
     Attributes:
         predictor: Simulates.
         sets: Objectives by name of the split: ``train``, ``validation``, ``test``.
-        names: Names of the logs of each split.
+        logs: The logs of each split.
         noise: Standard deviation of each channel's noise.
         noise_source: Where it comes from.
         horizon: Control steps per segment.
@@ -52,12 +51,17 @@ class Prepared:
 
     predictor: Predictor
     sets: Mapping[str, Objective]
-    names: Mapping[str, tuple[str, ...]]
+    logs: Mapping[str, Sequence[Log]]
     noise: Array
     noise_source: str
     horizon: int
     nominal: Fit
     alarms: tuple[str, ...]
+
+    @property
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """Names of the logs of each split."""
+        return {name: tuple(log.name for log in part) for name, part in self.logs.items()}
 
 
 def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
@@ -99,7 +103,6 @@ def prepare(
     *,
     generator: np.random.Generator,
     horizon: int | None = None,
-    predictor: Predictor | None = None,
 ) -> Prepared:
     """Split the logs, estimate the noise, choose the horizon, and fit the parameters.
 
@@ -109,14 +112,13 @@ def prepare(
         units: The effects that will be looked for; the horizon is chosen so that they show.
         generator: Of simulated noise, on which the whitening is checked.
         horizon: Control steps per segment; default chosen.
-        predictor: Simulates; default a new one.
 
     Raises:
         ValueError: No log is long enough.
     """
     if not logs:
         raise ValueError(message("logs", "none"))
-    predictor = Predictor(system) if predictor is None else predictor
+    predictor = Predictor(system)
     alarms: list[str] = []
     parts = split(logs)
     shortest = min(max(len(log) for log in part) for part in parts.values())
@@ -136,21 +138,25 @@ def prepare(
         )
         horizon = min(horizon, shortest // 2)
     pieces = {
-        name: cut(
-            part,
-            horizon,
-            history=history,
-            most=max(12, _ROWS[name] // horizon),
-            checks=_CHECKS,
-            burn_in=history,
-            skip=_SKIP,
-        )
+        name: _cut(part, horizon, history=history, most=max(12, _ROWS[name] // horizon))
         for name, part in parts.items()
     }
     nominal, whitenings = _nominal(predictor, system, pieces, noise=noise, generator=generator)
     sets = {n: Objective(predictor, system.prior, pieces[n], whitenings[n]) for n in pieces}
-    names = {n: tuple(log.name for log in part) for n, part in parts.items()}
-    return Prepared(predictor, sets, names, noise, source, horizon, nominal, tuple(alarms))
+    return Prepared(predictor, sets, parts, noise, source, horizon, nominal, tuple(alarms))
+
+
+def _cut(logs: Sequence[Log], horizon: int, *, history: int, most: int) -> Segments:
+    """Cut logs into the segments that fits, screens and figures are made on."""
+    return cut(
+        logs,
+        horizon,
+        history=history,
+        most=most,
+        checks=_CHECKS,
+        burn_in=history,
+        skip=_SKIP,
+    )
 
 
 def _start(system: System) -> Array:
@@ -181,8 +187,7 @@ def _noise(
     noise = np.maximum(np.where(np.isnan(given), smooth, given), tiny)
     steps = min(8, min(len(log) for log in logs) // 2)
     pieces = cut(logs, steps, history=history, most=60, burn_in=history)
-    pushes = units_of([effect("constant_force")], system.robot)
-    pushes = [unit for unit in pushes if unit.where != "all"]
+    pushes = pushes_of(system.robot)
     z = _start(system)
     for _ in range(2):
         white = whitening(predictor, pieces, parameters_at(system.prior, z), noise)
@@ -226,15 +231,7 @@ def _horizon(
     for steps in _LADDER:
         if steps > typical / 5:
             break
-        pieces = cut(
-            logs,
-            steps,
-            history=history,
-            most=max(4, _PROBE // steps),
-            checks=_CHECKS,
-            burn_in=history,
-            skip=_SKIP,
-        )
+        pieces = _cut(logs, steps, history=history, most=max(4, _PROBE // steps))
         white = whitening(predictor, pieces, parameters_at(system.prior, z), noise)
         if white.curvature > 1.0 and np.isfinite(best):
             break

@@ -72,7 +72,6 @@ def refit(
     starts: Sequence[Point],
     *,
     iterations: int = 5,
-    dispersion: float = 1.0,
     quick: bool = False,
 ) -> list[Fit]:
     """Fit parameters, and the strengths that each start has, from each start.
@@ -81,7 +80,6 @@ def refit(
         objective: What to make small.
         starts: One per fit; the units in its strengths are the ones to fit.
         iterations: Steps at most.
-        dispersion: The variance φ of innovations that the fit cannot remove.
         quick: Spare the derivatives at the end point; the fit's are of the step before.
     """
     models = [tuple(start.strengths) for start in starts]
@@ -92,7 +90,7 @@ def refit(
     ]
     damping = np.full(len(starts), 1e-3)
     bases, jacobians = _linearised(objective, models, vectors, boxes)
-    costs = _costs(bases, vectors, objective.size, dispersion)
+    costs = _costs(bases, vectors, objective.size)
     active = np.ones(len(starts), dtype=bool)
     for iteration in range(iterations):
         indices = np.flatnonzero(active)
@@ -106,7 +104,6 @@ def refit(
                 boxes[i],
                 damping=damping[i] * factor,
                 size=objective.size,
-                dispersion=dispersion,
             )
             for i in indices
             for factor in _TRIALS
@@ -118,7 +115,7 @@ def refit(
         moved = []
         for n, i in enumerate(indices):
             part = slice(n * len(_TRIALS), (n + 1) * len(_TRIALS))
-            found = _costs(residuals[part], trials[part], objective.size, dispersion)
+            found = _costs(residuals[part], trials[part], objective.size)
             best = int(np.argmin(found))
             if found[best] < costs[i]:
                 gain = costs[i] - found[best]
@@ -170,10 +167,10 @@ def _point(vector: Array, units: tuple[Unit, ...], size: int) -> Point:
 
 
 def _costs(
-    innovations: Sequence[Array] | Array, vectors: Sequence[Array], size: int, dispersion: float
+    innovations: Sequence[Array] | Array, vectors: Sequence[Array], size: int
 ) -> list[float]:
     return [
-        float((r**2).sum() / dispersion + (v[:size] ** 2).sum())
+        float((r**2).sum() + (v[:size] ** 2).sum())
         for r, v in zip(innovations, vectors, strict=True)
     ]
 
@@ -215,15 +212,14 @@ def _trial(
     *,
     damping: float,
     size: int,
-    dispersion: float,
 ) -> Array:
     """Return the damped Gauss-Newton step's end, inside the bounds."""
     if not len(vector):
         return vector
     prior = np.zeros(len(vector))
     prior[:size] = 1.0
-    normal = jacobian.T @ jacobian / dispersion + np.diag(prior)
-    gradient = jacobian.T @ innovations.ravel() / dispersion + prior * vector
+    normal = jacobian.T @ jacobian + np.diag(prior)
+    gradient = jacobian.T @ innovations.ravel() + prior * vector
     # coordinates at a bound that the gradient pushes against stay there
     pinned = ((vector <= box[0]) & (gradient > 0)) | ((vector >= box[1]) & (gradient < 0))
     free = ~pinned

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 __all__ = ["rollout_errors"]
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from ..logs.log import Log
-from ..logs.system import System
 from .objective import Point, strengths_of
-from .preparation import Prepared, split
+from .preparation import Prepared
 from .segments import cut
 
 
-def rollout_errors(
-    prepared: Prepared, system: System, logs: Sequence[Log], points: Mapping[str, Point]
-) -> dict[str, dict[str, float]]:
+def rollout_errors(prepared: Prepared, points: Mapping[str, Point]) -> dict[str, dict[str, float]]:
     """Return root mean square errors of each channel, by name of the point.
 
     Every test run is simulated from its first measured state to its end. Where a simulation
@@ -29,7 +25,7 @@ def rollout_errors(
     theta = objective.theta(np.stack([point.z for point in every]))
     strengths = strengths_of(every, predictor.system.robot)
     history = objective.segments.history
-    for log in split(logs)["test"]:
+    for log in prepared.logs["test"]:
         if len(log) < 3:
             continue
         whole = cut([log], len(log) - 1, history=history)
@@ -40,5 +36,5 @@ def rollout_errors(
     for name, parts in squares.items():
         error = np.sqrt(np.concatenate(parts).mean(0)) if parts else np.full(1, np.nan)
         error = np.nan_to_num(error, nan=np.inf)
-        result[name] = dict(zip(system.robot.channels, error.tolist(), strict=False))
+        result[name] = dict(zip(predictor.system.robot.channels, error.tolist(), strict=False))
     return result

@@ -103,7 +103,7 @@ def select(
         validation: Where they are judged.
         nominal: The fit of the parameters alone.
         units: The effects to consider, at each of their targets.
-        alpha: Level of the test that anything is missing, and of every further effect.
+        alpha: Level of the test that anything is missing, in every round.
         generator: Of the null distribution's draws.
         progress: Told what is done.
     """
@@ -120,12 +120,12 @@ def select(
         progress("fitting explanations")
         models = _explanations(train, validation, best, seen)
         tried += models
-        better = _needed_only(start, best, _chosen(best, models, alpha), models=models, alpha=alpha)
+        better = _needed_only(start, best, _chosen(best, models), models)
         if better is None or not _identified(start, best, better, models):
             break
         best = _exactly(train, validation, better)
     progress("taking out what is not needed")
-    best, dropped = _eliminated(train, validation, best, alpha)
+    best, dropped = _eliminated(train, validation, best)
     tried += dropped
     alternatives = {}
     if best.units:
@@ -232,10 +232,10 @@ def _criterion(model: Model, dispersion: float) -> float:
     return total / dispersion + len(model.units) * np.log(model.deviances().size * 8)
 
 
-def _chosen(base: Model, models: Sequence[Model], alpha: float) -> Model | None:
+def _chosen(base: Model, models: Sequence[Model]) -> Model | None:
     """Return the best model, if the segments that it was not fitted on say that it is better."""
     dispersion = min([base.dispersion(), *(m.dispersion() for m in models)])
-    better = [m for m in models if _gain(base, m) > _needed(base, m, alpha)]
+    better = [m for m in models if _gain(base, m) > _needed(base, m)]
     if not better:
         return None
     return min(better, key=lambda m: _criterion(m, dispersion))
@@ -245,15 +245,13 @@ def _needed_only(
     start: Model,
     base: Model,
     better: Model | None,
-    *,
     models: Sequence[Model],
-    alpha: float,
 ) -> Model | None:
     """Return the best model, or the one with a single new effect if more are a stopgap."""
     if better is None or len({u.name for u in better.units if u not in base.units}) < 2:
         return better
     single = [m for m in models if len({u.name for u in m.units if u not in base.units}) == 1]
-    smaller = _chosen(base, single, alpha)
+    smaller = _chosen(base, single)
     if smaller is None or _identified(start, smaller, better, models):
         return better
     return smaller
@@ -291,15 +289,12 @@ def _gain(base: Model, model: Model) -> float:
     return (before - after) / model.dispersion()
 
 
-def _needed(base: Model, model: Model, alpha: float) -> float:
+def _needed(base: Model, model: Model) -> float:
     """Return the gain on validation that more strengths need: the chance level per strength."""
-    del alpha
     return 4.0 * max(1, len(model.units) - len(base.units))
 
 
-def _eliminated(
-    train: Objective, validation: Objective, model: Model, alpha: float
-) -> tuple[Model, list[Model]]:
+def _eliminated(train: Objective, validation: Objective, model: Model) -> tuple[Model, list[Model]]:
     """Take out, one at a time, units without which the data are explained as well."""
     tried: list[Model] = []
     while model.units:
@@ -317,7 +312,7 @@ def _eliminated(
         best = int(np.argmin(criterion))
         loss = _gain(smaller[best], model)
         if criterion[best] > _criterion(model, model.dispersion()) and loss > _needed(
-            smaller[best], model, alpha
+            smaller[best], model
         ):
             break
         model = smaller[best]
