@@ -7,7 +7,7 @@ Gymnasium-Robotics (Plappert et al. 2018, https://arxiv.org/abs/1802.09464).
 
 from __future__ import annotations
 
-__all__ = ["euler", "fetch", "pick_and_place", "push", "reach", "slide"]
+__all__ = ["euler", "fetch", "goal_reward", "pick_and_place", "push", "reach", "slide"]
 
 from collections.abc import Callable, Mapping
 
@@ -65,8 +65,7 @@ def fetch(
     site = model.site("robot0:grip" if block is None else "object0").id
 
     def reward(_: Readings, after: Readings, action: Tensor) -> Tensor:  # noqa: ARG001
-        distance = (after.site_xpos[..., site, :] - after.goal).norm(dim=-1)
-        return -distance if dense else -(distance > _REACHED).double()
+        return goal_reward(after.site_xpos[..., site, :], after.goal, dense=dense)
 
     def reset(draws: Draws) -> dict[str, NDArray[np.float64]]:
         goal = gripper + draws.uniform(-goal_range, goal_range, size=3)
@@ -134,6 +133,16 @@ def slide(*, dense: bool = False) -> Task:
 def pick_and_place(*, dense: bool = False) -> Task:
     """FetchPickAndPlace-v4: bring a block to a goal on the table or in the air."""
     return fetch("pick_and_place", lift=0.2, locked=False, airborne=True, dense=dense)
+
+
+def goal_reward(achieved: Tensor, desired: Tensor, *, dense: bool = False) -> Tensor:
+    """Return -1 until the goal is reached within 5 cm, then 0; ``(*, 3), (*, 3) -> (*,)``.
+
+    With ``dense``, minus the distance in m. For hindsight, which asks what another goal would
+    have earned.
+    """
+    distance = (achieved - desired).norm(dim=-1)
+    return -distance if dense else -(distance > _REACHED).to(distance.dtype)
 
 
 def euler(matrix: Tensor) -> Tensor:

@@ -1,0 +1,157 @@
+import gymnasium
+import gymnasium_robotics
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_bayessim.agents.hindsight import HindsightReplayBuffer
+from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+from torchrl_bayessim.envs.tasks.fetch import goal_reward
+
+gymnasium.register_envs(gymnasium_robotics)
+
+
+def near(achieved, desired):
+    return -((achieved - desired).norm(dim=-1) > 0.5).float()
+
+
+def tagged(first, *, lengths, rows=1, stops=None):
+    """Return episodes whose goals are (episode, step reached); theta is the episode too."""
+    parts = []
+    for row in range(rows):
+        for i, length in enumerate(lengths):
+            time = torch.arange(length + 1.0)
+            tag = torch.full_like(time, first + row * len(lengths) + i)
+            place = torch.stack([tag, time if stops is None else time.clamp(max=stops)], -1)
+            goal = torch.full((length, 2), -7.0)
+            parts.append(
+                TensorDict(
+                    {
+                        "achieved_goal": place[:-1],
+                        "desired_goal": goal,
+                        "time": time[:-1],
+                        "theta": tag[:-1, None],
+                        "next": {
+                            "achieved_goal": place[1:],
+                            "desired_goal": goal,
+                            "theta": tag[1:, None],
+                            "reward": torch.full((length, 1), -1.0),
+                            "done": time[1:, None] == length,
+                        },
+                    },
+                    [length],
+                )
+            )
+    return torch.cat(parts).reshape(rows, -1)
+
+
+@pytest.mark.parametrize("name", ["FetchPush-v4", "FetchReach-v4"])
+def test_relabelled_rewards_are_those_of_gymnasium_robotics(name):
+    env = BatchedMujocoEnv(name, 8, threads=1, dtype=torch.float64)
+    episodes = env.rollout(50)
+    own = goal_reward(episodes["next", "achieved_goal"], episodes["desired_goal"])
+    assert torch.equal(own.unsqueeze(-1), episodes["next", "reward"])
+    buffer = HindsightReplayBuffer(goal_reward, capacity=1000, share=1.0, moving=None)
+    buffer.extend(episodes)
+    sample = buffer.sample(2000)
+    achieved, desired = sample["next", "achieved_goal"], sample["desired_goal"]
+    original = gymnasium.make(name).unwrapped
+    expected = original.compute_reward(achieved.numpy(), desired.numpy(), {})
+    assert sample["next", "reward"][:, 0].tolist() == expected.tolist()
+    if name == "FetchReach-v4":  # the gripper moves, so both rewards occur
+        assert 0.05 < (sample["next", "reward"] == 0).double().mean() < 0.95
+
+
+@pytest.mark.parametrize("capacity", [40, 37, 1000])
+def test_goals_come_from_the_future_of_the_same_episode_also_when_full(capacity):
+    buffer = HindsightReplayBuffer(near, capacity=capacity, share=1.0)
+    for first in range(0, 60, 6):  # 15 steps each time: it is full after the third
+        buffer.extend(tagged(first, lengths=(5, 2, 8)))
+        sample = buffer.sample(500)
+        episode, reached = sample["desired_goal"].unbind(-1)
+        assert torch.equal(episode, sample["theta"][:, 0])
+        assert torch.equal(episode, sample["next", "theta"][:, 0])
+        assert (reached > sample["time"]).all()
+        assert torch.equal(sample["desired_goal"], sample["next", "desired_goal"])
+        expected = near(sample["next", "achieved_goal"], sample["desired_goal"])
+        assert torch.equal(sample["next", "reward"][:, 0], expected)
+    assert len(buffer) == min(capacity, 150)
+
+
+def test_every_future_goal_is_as_likely_as_any_other():
+    buffer = HindsightReplayBuffer(near, capacity=100, share=1.0)
+    buffer.extend(tagged(0, lengths=(4,), rows=5))
+    sample = buffer.sample(20_000)
+    for time in range(4):
+        reached = sample["desired_goal"][sample["time"] == time, 1]
+        counts = torch.bincount(reached.long(), minlength=5)[time + 1 :]
+        expected = len(reached) / (4 - time)
+        assert (counts - expected).abs().max() < 5 * expected**0.5
+
+
+def test_the_share_is_relabelled_and_the_rest_is_as_it_was():
+    buffer = HindsightReplayBuffer(near, capacity=100, share=0.75)
+    buffer.extend(tagged(0, lengths=(4,), rows=5))
+    sample = buffer.sample(200)
+    kept = (sample["desired_goal"] == -7).all(-1)
+    assert kept.tolist() == [False] * 150 + [True] * 50
+    assert (sample["next", "reward"][150:] == -1).all()
+    assert (buffer.sample(200)["desired_goal"][150:] == -7).all()  # nothing is written back
+
+
+def test_only_moving_transitions_are_relabelled():
+    episodes = torch.cat(
+        [tagged(0, lengths=(8,), stops=3), tagged(1, lengths=(8,), stops=0)]
+    )  # one object stops after three steps, the other never moves
+    picky = HindsightReplayBuffer(near, capacity=100, share=0.5, moving=0.1)
+    picky.extend(episodes)
+    sample = picky.sample(1000)
+    assert set(sample["time"][:500].tolist()) == {0.0, 1.0, 2.0}
+    assert (sample["theta"][:500] == 0).all()
+    assert set(sample["time"][500:].tolist()) == set(range(8))
+    plain = HindsightReplayBuffer(near, capacity=100, share=0.5, moving=None)
+    plain.extend(episodes)
+    assert set(plain.sample(1000)["time"][:500].tolist()) == set(range(8))
+
+
+def test_without_any_movement_all_transitions_are_relabelled_alike():
+    buffer = HindsightReplayBuffer(near, capacity=100, share=1.0, moving=0.1)
+    buffer.extend(tagged(0, lengths=(8,), stops=0))
+    assert set(buffer.sample(500)["time"].tolist()) == set(range(8))
+
+
+def test_restored_it_gives_the_same_samples():
+    buffer = HindsightReplayBuffer(near, capacity=37, share=0.8)
+    for first in range(5):
+        buffer.extend(tagged(first, lengths=(10,)))
+    twin = HindsightReplayBuffer(near, capacity=37, share=0.8)
+    twin.extend(tagged(99, lengths=(3,)))
+    twin.restore(buffer.contents())
+    for held in (buffer, twin):
+        held.extend(tagged(7, lengths=(9,)))
+    samples = []
+    for held in (buffer, twin):
+        torch.manual_seed(1)
+        samples.append(held.sample(100))
+    assert (samples[0] == samples[1]).all()
+
+
+def test_unfinished_episodes_are_refused():
+    buffer = HindsightReplayBuffer(near, capacity=100)
+    with pytest.raises(ValueError, match=r"end with their row, got 'unfinished ones in rows \[1\]"):
+        buffer.extend(torch.cat([tagged(0, lengths=(5,)), tagged(1, lengths=(9,))[:, :5]]))
+    with pytest.raises(ValueError, match="at most 100 transitions at once, got 101"):
+        buffer.extend(tagged(0, lengths=(101,)))
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"share": 1.1}, r"relabelled transitions in \[0, 1\], got 1.1"),
+        ({"capacity": 0}, "at least 1 transition, got 0"),
+        ({"moving": -1.0}, "not negative, or None, got -1.0"),
+    ],
+)
+def test_impossible_settings_are_refused(options, match):
+    with pytest.raises(ValueError, match=match):
+        HindsightReplayBuffer(near, **({"capacity": 10} | options))

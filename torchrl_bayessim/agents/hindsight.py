@@ -1,0 +1,182 @@
+"""Hindsight replay: what was reached is what was meant (Andrychowicz et al. 2017, sec. 3).
+
+TorchRL's `HERReplayBuffer` relabels a share of every sample. It finds the ends of episodes by
+searching the storage, which fails once the storage is full and mixes environments whose episodes
+are unfinished (TorchRL 0.14.1). Here every transition knows how many follow it in its episode, and
+goals are counted on from there: round the end of the storage, and never into another episode.
+"""
+
+from __future__ import annotations
+
+__all__ = ["GoalReward", "HindsightReplayBuffer"]
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import LazyTensorStorage
+from torchrl.data.replay_buffers import Sampler, Storage
+from torchrl.data.replay_buffers.her import HERReplayBuffer
+
+from ..errors import message
+
+GoalReward = Callable[[Tensor, Tensor], Tensor]
+"""``(achieved (*, G), desired (*, G)) -> reward (*,)``, the environment's own."""
+
+_FOLLOWING, _MOVES = "following", "moves"
+
+
+class HindsightReplayBuffer(HERReplayBuffer):
+    """Replays transitions, a share of them with a goal that their episode reached later.
+
+    A relabelled transition ``t`` of an episode of length ``T`` gets as desired goal what was
+    achieved after step ``t' ~ U{t, …, T - 1}``, and the reward for it. All else is as it was: the
+    state, the action, and the physics that the episode ran under.
+
+    With ``moving``, relabelled transitions come only from where the achieved goal is yet to change:
+    ``‖achieved_t - achieved_T‖ > moving``. An object that is never touched again has reached every
+    goal that hindsight could give it, whatever the action was (Manela & Biess 2019,
+    https://arxiv.org/abs/1905.05498).
+
+    Draws come from torch's global generator; see :func:`.randomness.isolated`.
+
+    Args:
+        reward: The environment's reward as a function of the achieved and the desired goal.
+        capacity: Transitions held; the oldest make room.
+        share: Of the transitions of a sample that are relabelled, the first ones of it.
+        moving: Least distance to the episode's end at which a transition is relabelled, in the
+            goal's unit; None to relabel any.
+
+    Raises:
+        ValueError: ``share`` is no probability, ``capacity`` not positive, or ``moving`` negative.
+
+    Example:
+        >>> reached = lambda achieved, desired: -((achieved - desired).norm(dim=-1) > 0.1).float()
+        >>> buffer = HindsightReplayBuffer(reached, capacity=1000, share=1.0)
+        >>> place = torch.arange(4.0).expand(2, 4).unsqueeze(-1)  # two episodes, one step a second
+        >>> entries = {"achieved_goal": place, "desired_goal": torch.full((2, 4, 1), 9.0)}
+        >>> following = {k: v + (k == "achieved_goal") for k, v in entries.items()}
+        >>> following |= {"reward": -torch.ones(2, 4, 1), "done": place == 3}
+        >>> buffer.extend(TensorDict(entries | {"next": following}, [2, 4])).shape
+        torch.Size([8])
+        >>> sample = buffer.sample(100)
+        >>> bool((sample["desired_goal"] > sample["achieved_goal"]).all())
+        True
+    """
+
+    def __init__(
+        self, reward: GoalReward, *, capacity: int, share: float = 0.8, moving: float | None = 1e-3
+    ) -> None:
+        if not 0 <= share <= 1:
+            raise ValueError(message("a share of relabelled transitions in [0, 1]", share))
+        if capacity < 1:
+            raise ValueError(message("a capacity of at least 1 transition", capacity))
+        if moving is not None and moving < 0:
+            raise ValueError(message("a distance that is not negative, or None", moving))
+        self.capacity, self.moving = capacity, moving
+
+        def relabelled(sample: TensorDictBase) -> Tensor:
+            value = reward(sample["next", "achieved_goal"], sample["desired_goal"])
+            return value.unsqueeze(-1).to(sample["next", "reward"].dtype)
+
+        super().__init__(
+            relabelled,
+            her_ratio=share,
+            strategy="future",
+            achieved_goal_key=("next", "achieved_goal"),
+            sampler=_MovingFirst(share, moving is not None),
+            storage=LazyTensorStorage(capacity),
+        )
+
+    def extend(self, episodes: TensorDictBase) -> Tensor:
+        """Take in whole episodes and return where they are.
+
+        Args:
+            episodes: Batch size ``[N, T]``; each row one or several episodes, the last one ended.
+
+        Raises:
+            ValueError: A row ends within an episode, or holds more than fits.
+        """
+        done = episodes["next", "done"].reshape(episodes.batch_size)
+        if episodes.ndim != 2 or not done[:, -1].all():
+            rows = (~done[:, -1]).nonzero().flatten().tolist() if done.ndim == 2 else done.shape
+            raise ValueError(
+                message(
+                    "episodes [N, T] that end with their row",
+                    f"unfinished ones in rows {rows}",
+                    hint="batches that begin with a reset, of as many steps as an episode has",
+                )
+            )
+        if done.numel() > self.capacity:
+            raise ValueError(message(f"at most {self.capacity} transitions at once", done.numel()))
+        end = _end_of_episode(done)
+        time = torch.arange(done.shape[1])
+        final = episodes["next", "achieved_goal"].gather(
+            1, end.unsqueeze(-1).expand_as(episodes["achieved_goal"])
+        )
+        distance = torch.linalg.vector_norm(episodes["achieved_goal"] - final, dim=-1)
+        marks = {_FOLLOWING: end - time, _MOVES: distance > (self.moving or 0.0)}
+        return super().extend(episodes.copy().update(marks).reshape(-1))
+
+    # What TorchRL searches the storage for, each transition knows.
+
+    def _get_episode_ends(self, storage: Storage) -> Tensor:  # noqa: ARG002
+        return torch.zeros(1, dtype=torch.long)
+
+    def _get_episode_range(self, idx: Tensor, episode_ends: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ARG002
+        return idx, idx + self._storage[:][_FOLLOWING][idx]
+
+    def _sample_goal_indices(self, *args: Any) -> Tensor:
+        return super()._sample_goal_indices(*args) % self.capacity
+
+    def contents(self) -> dict[str, Any]:
+        """Return what it holds as plain values and tensors, for `restore`."""
+        if not len(self):
+            return {}
+        entries = self._storage[:].flatten_keys(".")
+        return {"entries": dict(entries.items()), "cursor": int(self._writer._cursor)}
+
+    def restore(self, contents: Mapping[str, Any]) -> None:
+        """Hold what `contents` returned, in the same places."""
+        self.empty()
+        if contents:
+            entries = contents["entries"]
+            held = TensorDict(dict(entries), [len(entries[_FOLLOWING])]).unflatten_keys(".")
+            super().extend(held)
+            self._writer._cursor = contents["cursor"]
+
+
+class _MovingFirst(Sampler):
+    """Uniform indices with replacement, the first ``share`` of them where the goal yet moves."""
+
+    def __init__(self, share: float, moving: bool) -> None:  # noqa: FBT001
+        super().__init__()
+        self.share, self.moving = share, moving
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:
+        held = storage[:]
+        index = torch.randint(len(held), (batch_size,))
+        first = int(batch_size * self.share)
+        if self.moving and first:
+            moving = held[_MOVES].nonzero().flatten()
+            if len(moving):
+                index[:first] = moving[torch.randint(len(moving), (first,))]
+        return index, {}
+
+    # without state, but abstract in TorchRL
+    def _empty(self) -> None: ...
+    def dumps(self, path: Any) -> None: ...
+    def loads(self, path: Any) -> None: ...
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None: ...
+
+
+def _end_of_episode(done: Tensor) -> Tensor:
+    """Return the step at which the episode of each step ends, ``(N, T) -> (N, T)``."""
+    steps = torch.arange(done.shape[1]).expand(done.shape)
+    ends = torch.where(done, steps, done.shape[1])
+    return ends.flip(1).cummin(1).values.flip(1)
