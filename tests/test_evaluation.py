@@ -6,8 +6,9 @@ from torchrl.envs import GymEnv
 from torchrl_bayessim.agents.ppo import PPO
 from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
 from torchrl_bayessim.envs.classic_control.mountain_car import MountainCarEnv
+from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.errors import SimulationError
-from torchrl_bayessim.evaluation import evaluate
+from torchrl_bayessim.evaluation import evaluate, successes
 
 
 def always(index, n):
@@ -61,3 +62,27 @@ def test_rewards_that_are_not_finite_are_not_averaged_away():
 
     with pytest.raises(SimulationError, match="finite rewards"):
         evaluate(Broken(2), always(0, 2), max_steps=5)
+
+
+def towards_the_goal(gain):
+    """Move the gripper to the goal, 5 cm per unit of action."""
+
+    def act(observation, goal):
+        step = gain * (goal - observation[..., :3]) / 0.05
+        return torch.cat([step.clamp(-1, 1), step[..., :1] * 0], -1)
+
+    return TensorDictModule(act, in_keys=["observation", "desired_goal"], out_keys=["action"])
+
+
+@pytest.mark.parametrize(("gain", "reached"), [(1.0, True), (-1.0, False)])
+def test_success_is_being_at_the_goal_in_the_end(gain, reached):
+    env = BatchedMujocoEnv("FetchReach-v4", 6, threads=1)
+    found = successes(env, towards_the_goal(gain), max_steps=60)  # ten steps of the next episode
+    assert found.tolist() == [reached] * 6
+    steps = env.rollout(50, towards_the_goal(gain))
+    assert (steps["next", "reward"][:, 0] == -1).any()  # not all are there from the start
+
+
+def test_success_needs_sparse_goal_rewards():
+    with pytest.raises(ValueError, match=r"sparse goal rewards, -1 or 0, got \[1.0\]"):
+        successes(CartPoleEnv(2, max_steps=5), always(1, 2), max_steps=5)

@@ -1,8 +1,8 @@
-"""What a policy earns: one episode per environment, without exploration."""
+"""What a policy earns and reaches: one episode per environment, without exploration."""
 
 from __future__ import annotations
 
-__all__ = ["evaluate"]
+__all__ = ["evaluate", "successes"]
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -54,3 +54,38 @@ def evaluate(env: EnvBase, policy: TensorDictModuleBase, *, max_steps: int) -> T
                 break
             tensordict = following
     return total
+
+
+@torch.no_grad()
+def successes(env: EnvBase, policy: TensorDictModuleBase, *, max_steps: int) -> Tensor:
+    """Return whether each environment's goal is reached at the end of its episode.
+
+    That is a reward of zero for the last step, as sparse goal rewards have it: -1 until the goal
+    is reached, then 0 for as long as it is (Plappert et al. 2018). Shape ``env.batch_size``.
+
+    Args:
+        env: An environment of sparse goal rewards; it is reset first.
+        policy: Such as `DDPG.policy`; its deterministic actions are taken.
+        max_steps: Longest episode.
+
+    Raises:
+        ValueError: ``max_steps`` is not positive, or a reward is neither -1 nor 0.
+
+    Example:
+        >>> from torchrl_bayessim.agents.ddpg import DDPG
+        >>> from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+        >>> from torchrl_bayessim.envs.tasks.fetch import goal_reward
+        >>> env = BatchedMujocoEnv("FetchReach-v4", 3, threads=1)
+        >>> successes(env, DDPG(env, goal_reward).policy, max_steps=50)
+        tensor([False, False, False])
+    """
+    if max_steps < 1:
+        raise ValueError(message("max_steps of at least 1", max_steps))
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        steps = env.rollout(max_steps, policy, break_when_any_done=False)
+    first = steps["next", "done"].squeeze(-1).long().argmax(-1)  # 0 if none ended
+    first = torch.where(steps["next", "done"].any(-2).squeeze(-1), first, steps.shape[-1] - 1)
+    reward = steps["next", "reward"].squeeze(-1)
+    if not ((reward == 0) | (reward == -1)).all():
+        raise ValueError(message("sparse goal rewards, -1 or 0", reward.unique().tolist()[:5]))
+    return reward.gather(-1, first.unsqueeze(-1)).squeeze(-1) == 0

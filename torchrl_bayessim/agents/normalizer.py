@@ -9,13 +9,16 @@ from torch import Tensor, nn
 
 
 class Normalizer(nn.Module):
-    """``(x − mean) / std``, clipped to ±10, with statistics that change only in `observe`.
+    """``(x − mean) / std``, clipped, with statistics that change only in `observe`.
 
     Mean and variance over all observed rows are merged batch by batch (Chan, Golub & LeVeque,
     1983). A feature that never varied is only centred.
 
     Args:
         size: Number of features ``D``.
+        clip: Largest magnitude that is handed on.
+        least_std: Standard deviations below it count as it, in the features' units: noise of a
+            feature that hardly varies is then not blown up.
 
     Example:
         >>> normalizer = Normalizer(1)
@@ -30,8 +33,9 @@ class Normalizer(nn.Module):
     shift: Tensor
     scale: Tensor
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, *, clip: float = 10.0, least_std: float = 0.0) -> None:
         super().__init__()
+        self.clip, self.least_std = clip, least_std
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("variance", torch.ones(size, dtype=torch.float64))
@@ -40,7 +44,7 @@ class Normalizer(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalise ``x`` of shape ``(*, D)``."""
-        return ((x.to(self.shift.dtype) - self.shift) * self.scale).clamp(-10.0, 10.0)
+        return ((x.to(self.shift.dtype) - self.shift) * self.scale).clamp(-self.clip, self.clip)
 
     @torch.no_grad()
     def observe(self, x: Tensor) -> None:
@@ -58,4 +62,5 @@ class Normalizer(nn.Module):
         self.count += len(x)
         varies = self.variance > 1e-12
         self.shift.copy_(self.mean)
-        self.scale.copy_(torch.where(varies, self.variance.rsqrt(), 1.0))
+        least = self.variance.clamp(min=self.least_std**2)
+        self.scale.copy_(torch.where(varies, least.rsqrt(), 1.0))

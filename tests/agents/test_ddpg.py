@@ -1,0 +1,262 @@
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.data import Unbounded
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_bayessim.agents.actor_critic_losses import (
+    BoundedDDPGLoss,
+    BoundedTD0,
+    BoundedTD3Loss,
+)
+from torchrl_bayessim.agents.ddpg import DDPG
+from torchrl_bayessim.agents.goal_networks import Actor, Critic
+from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
+from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+from torchrl_bayessim.envs.tasks.fetch import goal_reward
+from torchrl_bayessim.errors import SimulationError
+from torchrl_bayessim.evaluation import successes
+from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.physics.mujoco import MujocoPhysics
+from torchrl_bayessim.randomness import isolated
+from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
+
+SMALL = {"hidden": (32, 32), "batch_size": 64, "updates_per_frame": 0.05, "capacity": 1000}
+FRICTION = ("geom_friction[body:table0,0]", "geom_friction[object0,0]")
+
+
+def push(n=4, seed=0):
+    physics = ApplyPhysics(MujocoPhysics(friction=FRICTION))
+    prior = DomainRandomizer(BoxPrior({"friction": (0.1, 1.0)}))
+    env = BatchedMujocoEnv("FetchPush-v4", n, seed=seed, threads=1)
+    return TransformedEnv(env, Compose(physics, prior))
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    return push().rollout(50, break_when_any_done=False)
+
+
+def changed(before, after):
+    return {name for name in after if not torch.equal(before[name], after[name])}
+
+
+def test_learns_to_reach():
+    env = BatchedMujocoEnv("FetchReach-v4", 16, threads=1)
+    learner = DDPG(
+        env,
+        goal_reward,
+        hidden=(64, 64),
+        batch_size=64,
+        tau=0.02,
+        updates_per_frame=0.15,
+        learning_rate=3e-3,
+    )
+    scoring = BatchedMujocoEnv("FetchReach-v4", 32, seed=1, threads=1)
+    before = successes(scoring, learner.policy, max_steps=50)
+    for i in range(6):
+        with isolated(i), torch.no_grad():
+            batch = env.rollout(50, learner.policy, break_when_any_done=False)
+        learner.update(batch, key=(i,), progress=i / 6)
+    after = successes(scoring, learner.policy, max_steps=50)
+    assert before.double().mean() < 0.3
+    assert after.double().mean() > 0.6
+
+
+@pytest.mark.parametrize(
+    ("value", "terminated", "target"),
+    [(-10.0, False, -1 + 0.98 * -10), (30.0, False, 0.0), (-1e6, False, -50.0), (-10.0, True, -1)],
+)
+def test_targets_are_bounded_by_what_returns_can_be(value, terminated, target):
+    step = {
+        "reward": torch.full((3, 1), -1.0),
+        "done": torch.full((3, 1), terminated),
+        "terminated": torch.full((3, 1), terminated),
+        "state_value": torch.full((3, 1), value),
+    }
+    found = BoundedTD0(gamma=0.98, rewards=(-1.0, 0.0)).value_estimate(
+        TensorDict({"next": step}, [3])
+    )
+    assert found.flatten().tolist() == pytest.approx([target] * 3)
+
+
+@pytest.mark.parametrize("loss_type", [BoundedDDPGLoss, BoundedTD3Loss])
+def test_the_actor_pays_for_the_square_of_its_actions(loss_type):
+    actor, critic = Actor(5, (8,), 2), Critic(7, (8,))
+    batch = TensorDict({"state": torch.randn(20, 5)}, [20])
+    losses = [
+        loss_type(
+            TensorDictModule(actor, ["state"], ["action"]),
+            TensorDictModule(critic, ["state", "action"], ["state_action_value"]),
+            gamma=0.98,
+            rewards=(-1.0, 0.0),
+            action_l2=weight,
+        )
+        for weight in (0.0, 3.0)
+    ]
+    values = []
+    for loss in losses:
+        copied = loss.named_parameters()
+        source = dict(losses[0].named_parameters())
+        for name, parameter in copied:  # TD3 draws its critics afresh
+            parameter.data.copy_(source[name])
+        values.append(loss.policy_loss(batch).item())
+    paid = 3 * actor(batch["state"]).square().mean().item()
+    assert values[1] - values[0] == pytest.approx(paid, rel=1e-4)
+
+
+def test_target_networks_follow_by_tau(episodes):
+    learner = DDPG(push(), goal_reward, **SMALL | {"updates_per_frame": 1 / 200, "tau": 0.1})
+    before = {name: value.clone() for name, value in learner._tensors().items()}
+    learner.update(episodes, key=(0,))
+    after = learner._tensors()
+    name = "value_network_params.module.layers.0.weight"
+    assert not torch.equal(before[name], after[name])
+    expected = 0.9 * before[f"target_{name}"] + 0.1 * after[name]
+    torch.testing.assert_close(after[f"target_{name}"], expected)
+
+
+def test_td3_has_two_critics_and_delays_its_actor(episodes):
+    learner = DDPG(push(), goal_reward, algorithm="td3", **SMALL | {"updates_per_frame": 1 / 200})
+    assert learner.name == "TD3+HER"
+    assert DDPG(push(), goal_reward, **SMALL).name == "DDPG+HER"
+    names = {n for n in learner._tensors() if "target" not in n}
+    assert all(len(v) == 2 for n, v in learner._tensors().items() if "value" in n)
+    before = {name: value.clone() for name, value in learner._tensors().items()}
+    learner.update(episodes, key=(0,))  # one update
+    moved = changed(before, learner._tensors())
+    assert {n for n in names if "qvalue" in n} <= moved
+    assert not {n for n in moved if "actor" in n}
+    learner.updates_per_frame = 2 / 200
+    learner.update(episodes, key=(1,))
+    assert {n for n in names if "actor" in n} <= changed(before, learner._tensors())
+
+
+def test_the_critic_sees_the_physics_and_the_actor_never(episodes):
+    learner = DDPG(push(), goal_reward, critic_keys=["theta"], **SMALL)
+    learner.update(episodes, key=(0,))
+    assert "theta" not in learner.policy.in_keys
+    steps = episodes.reshape(-1)[:10]
+    other = steps.clone().set("theta", steps["theta"] + 0.5)
+    states = [learner.state.full(part) for part in (steps, other)]
+    action = torch.zeros(10, 4)
+    loss = learner._loss
+    with loss.value_network_params.to_module(loss.value_network), torch.no_grad():
+        critic = loss.value_network.module
+        assert not torch.allclose(critic(states[0], action), critic(states[1], action))
+    with loss.actor_network_params.to_module(loss.actor_network), torch.no_grad():
+        actor = loss.actor_network.module
+        assert torch.equal(actor(states[0]), actor(states[1]))
+
+
+def test_the_policy_is_the_actor_that_learns(episodes):
+    learner = DDPG(push(), goal_reward, **SMALL)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        before = learner.policy(episodes.clone())["action"]
+        learner.update(episodes, key=(0,))
+        after = learner.policy(episodes.clone())["action"]
+        state = learner.state.full(episodes)
+        loss = learner._loss
+        with loss.actor_network_params.to_module(loss.actor_network):
+            torch.testing.assert_close(after, loss.actor_network.module(state))
+    assert not torch.allclose(before, after)
+
+
+def test_exploration_is_part_uniform_and_part_noise():
+    env = push(64)
+    learner = DDPG(env, goal_reward, random_share=0.3, noise=0.05, **SMALL)
+    start = env.reset()
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        mean = learner.policy(start.clone())["action"]
+    with torch.no_grad():
+        actions = torch.stack([learner.policy(start.clone())["action"] for _ in range(50)])
+    assert actions.abs().max() <= 1
+    far = (actions - mean).abs().amax(-1) > 0.25  # five standard deviations
+    assert 0.25 < far.double().mean() < 0.33
+    noise = (actions - mean)[~far]
+    assert 0.04 < noise.std() < 0.08  # some uniform actions lie near by chance
+
+
+def test_statistics_are_those_of_observations_and_of_meant_and_reached_goals(episodes):
+    learner = DDPG(push(), goal_reward, critic_keys=["theta"], **SMALL)
+    learner.update(episodes, key=(0,))
+    normalizer = learner.state.normalizer
+    observed = episodes["observation"].flatten(0, 1).double()
+    torch.testing.assert_close(normalizer.mean[:25], observed.mean(0))
+    goals = torch.cat([episodes["desired_goal"], episodes["next", "achieved_goal"]])
+    torch.testing.assert_close(normalizer.mean[25:], goals.double().flatten(0, 1).mean(0))
+    assert normalizer.scale.max() <= 100  # of 1 / 0.01: standing fingers are not blown up
+    assert learner.state.full(episodes).abs().max() <= 5
+
+
+def test_resumed_it_learns_the_same(episodes):
+    learner = DDPG(push(), goal_reward, algorithm="td3", **SMALL)
+    learner.update(episodes, key=(0,))
+    twin = DDPG(push(), goal_reward, algorithm="td3", **SMALL | {"seed": 0})
+    twin.load_state_dict(copy.deepcopy(learner.state_dict()))
+    reports = [one.update(episodes, key=(1,), progress=0.9) for one in (learner, twin)]
+    assert reports[0] == reports[1]
+    assert not changed(learner._tensors(), twin._tensors())
+
+
+def test_the_learning_rate_is_constant_and_then_falls(episodes):
+    learner = DDPG(push(), goal_reward, **SMALL | {"updates_per_frame": 1 / 200})
+    rates = [
+        learner.update(episodes, key=(0,), progress=p)["learning_rate"] for p in (0, 0.6, 0.8, 1)
+    ]
+    assert rates == pytest.approx([1e-3, 1e-3, 5.5e-4, 1e-4])
+
+
+def test_a_critic_that_is_nan_stops_the_training(episodes):
+    learner = DDPG(push(), goal_reward, **SMALL)
+    name = "value_network_params.module.layers.0.weight"
+    learner._tensors()[name][0, 0] = torch.nan
+    before = {name: value.clone() for name, value in learner._tensors().items()}
+    with pytest.raises(
+        SimulationError, match=r"finite loss of the critic, got nan.*Try: a smaller"
+    ):
+        learner.update(episodes, key=(0,))
+    del before[name]
+    assert not changed(before, {n: learner._tensors()[n] for n in before})
+
+
+def test_bad_batches_are_refused(episodes):
+    learner = DDPG(push(), goal_reward, **SMALL)
+    broken = episodes.clone()
+    broken["next", "observation"][1, 3] = torch.nan
+    with pytest.raises(SimulationError, match=r"finite \('next', 'observation'\) in the batch"):
+        learner.update(broken, key=(0,))
+    with pytest.raises(ValueError, match="no 'achieved_goal'"):
+        learner.update(episodes.exclude("achieved_goal"), key=(0,))
+    with pytest.raises(ValueError, match=r"episodes .* that end with their row"):
+        learner.update(episodes[:, :30], key=(0,))
+    assert len(learner.buffer) == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "match"),
+    [
+        ({"algorithm": "td4"}, ValueError, r"got 'td4'. Available: td3 \(did you mean this\?\)"),
+        ({"capacity": 63}, ValueError, "replay buffer of at least one batch of 64, got 63"),
+        ({"critic_keys": ["thetaa"]}, ValueError, r"theta \(did you mean this\?\)"),
+    ],
+)
+def test_impossible_settings_are_refused(options, error, match):
+    with pytest.raises(error, match=match):
+        DDPG(push(), goal_reward, **SMALL | options)
+
+
+def test_environments_without_goals_or_bounds_are_refused(episodes):
+    with pytest.raises(ValueError, match=r"observes observation, achieved_goal, desired_goal, got"):
+        DDPG(CartPoleEnv(2, max_steps=10), goal_reward)
+    env = BatchedMujocoEnv("FetchReach-v4", 2, threads=1)
+    env.action_spec = Unbounded((2, 4))
+    with pytest.raises(TypeError, match="a bounded action spec, got 'Unbounded"):
+        DDPG(env, goal_reward)
+    learner = DDPG(push(), goal_reward, **SMALL | {"batch_size": 201, "capacity": 300})
+    with pytest.raises(ValueError, match="holds at least one batch of 201, got 200"):
+        learner.update(episodes, key=(0,))

@@ -1,0 +1,297 @@
+"""DDPG with hindsight replay for goals: a deterministic policy, improved from what it reached.
+
+DDPG (Lillicrap et al. 2016) or, by one option, TD3 (Fujimoto et al. 2018), with TorchRL's losses;
+hindsight and the defaults follow Andrychowicz et al. (2017) and Plappert et al. (2018,
+https://arxiv.org/abs/1802.09464) but for what is said at the arguments.
+"""
+
+from __future__ import annotations
+
+__all__ = ["DDPG"]
+
+import copy
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+from torchrl.objectives import SoftUpdate
+
+from ..errors import SimulationError, message
+from ..randomness import isolated
+from .actor_critic_losses import BoundedDDPGLoss, BoundedTD3Loss
+from .goal_networks import GOAL_KEYS, Actor, Critic, GoalState, action_bounds, goal_policy
+from .hindsight import GoalReward, HindsightReplayBuffer
+
+_LOSSES = {"ddpg": BoundedDDPGLoss, "td3": BoundedTD3Loss}
+_AT_ONCE = 160  # batches sampled in one go
+
+
+class DDPG:
+    """A policy for the goals of ``env`` and what improves it.
+
+    Actions are ``π(observation, desired goal)`` in the bounds of the action spec. While exploring
+    (`ExplorationType.RANDOM`), a share of actions is uniform and the others get Gaussian noise.
+
+    Args:
+        env: The environment (or one like it) that batches will come from; only its specs are read.
+            It observes ``observation``, ``achieved_goal`` and ``desired_goal``.
+        reward: Its reward, a function of the achieved and the desired goal.
+        seed: Seed of the initial parameters and, with the key, of every update.
+        algorithm: ``ddpg`` or ``td3`` (two critics, target noise, an actor that learns at every
+            second update; target networks still follow at every one).
+        critic_keys: What the critic sees besides, such as the physics parameters ``theta``: it is
+            needed in training only, so it may know what the robot cannot (Pinto et al., 2018).
+        hidden: Width of each hidden layer of actor and critics.
+        gamma: Discount per step.
+        rewards: Least and greatest reward; targets are clamped to the returns that they allow.
+        learning_rate: Of both Adams.
+        final_learning_rate: At progress 1; linear from ``decay_from`` on.
+        decay_from: Progress until which the learning rate is constant.
+        tau: Share of the networks that flows into the target networks at each update.
+        batch_size: Transitions per update.
+        updates_per_frame: Updates per transition that comes in.
+        capacity: Transitions in the replay buffer.
+        relabelled: Share of relabelled transitions.
+        moving: See `HindsightReplayBuffer`.
+        action_l2: Weight of the mean squared action in the actor's loss.
+        random_share: Share of uniformly random actions while exploring.
+        noise: Standard deviation of the noise on the others, in units of half the action range.
+
+    Attributes:
+        policy: Reads observation and desired goal, writes ``action``; hand it to a collector. It
+            explores unless `set_exploration_type` says otherwise.
+        name: ``DDPG+HER`` or ``TD3+HER``, for tables.
+        buffer: The replay buffer.
+        settings: What updates depend on; a loop refuses the checkpoint of other ones.
+
+    Raises:
+        ValueError: A goal key is not observed, the replay buffer is smaller than one batch, or
+            there is no such algorithm.
+        TypeError: The actions are not bounded.
+
+    Example:
+        >>> from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+        >>> from torchrl_bayessim.envs.tasks.fetch import goal_reward
+        >>> env = BatchedMujocoEnv("FetchReach-v4", 4, threads=1)
+        >>> ddpg = DDPG(env, goal_reward, batch_size=32)
+        >>> with torch.no_grad():
+        ...     episodes = env.rollout(50, ddpg.policy)
+        >>> sorted(ddpg.update(episodes, key=("round", 0)))
+        ['learning_rate', 'loss_actor', 'loss_critic', 'updates']
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        reward: GoalReward,
+        *,
+        seed: int = 0,
+        algorithm: str = "ddpg",
+        critic_keys: Sequence[str] = (),
+        hidden: Sequence[int] = (256, 256, 256),
+        gamma: float = 0.98,
+        rewards: tuple[float, float] = (-1.0, 0.0),
+        learning_rate: float = 1e-3,
+        final_learning_rate: float = 1e-4,
+        decay_from: float = 0.6,
+        tau: float = 0.005,
+        batch_size: int = 256,
+        updates_per_frame: float = 0.2,
+        capacity: int = 1_000_000,
+        relabelled: float = 0.8,
+        moving: float | None = 1e-3,
+        action_l2: float = 1.0,
+        random_share: float = 0.3,
+        noise: float = 0.2,
+    ) -> None:
+        self.settings: dict[str, Any] = {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in locals().items()
+            if name not in ("self", "env", "reward")
+        }
+        if algorithm not in _LOSSES:
+            raise ValueError(message("an algorithm", algorithm, available=_LOSSES))
+        if capacity < batch_size:
+            raise ValueError(
+                message(f"a replay buffer of at least one batch of {batch_size}", capacity)
+            )
+        self.name = f"{algorithm.upper()}+HER"
+        self.seed, self.batch_size = seed, batch_size
+        self.updates_per_frame, self._actor_every = updates_per_frame, 1 + (algorithm == "td3")
+        self._rates = learning_rate, final_learning_rate, decay_from
+        self.state = GoalState(env, critic_keys)
+        self._bounds = action_bounds(env)
+        size, wide = len(self._bounds[0]), self.state.seen + self.state.hidden_width
+        with isolated(seed, "ddpg parameters"):
+            actor = Actor(self.state.seen, hidden, size)
+            critic = Critic(wide + size, hidden)
+            self._loss = _LOSSES[algorithm](
+                TensorDictModule(actor, ["state"], ["action"]),
+                TensorDictModule(critic, ["state", "action"], ["state_action_value"]),
+                gamma=gamma,
+                rewards=rewards,
+                action_l2=action_l2,
+            )
+        self.policy = goal_policy(env, self.state, actor, noise=noise, random_share=random_share)
+        self.buffer = HindsightReplayBuffer(
+            reward, capacity=capacity, share=relabelled, moving=moving
+        )
+        self._targets = SoftUpdate(self._loss, tau=tau)
+        self._optimizers = {
+            part: torch.optim.Adam(self._parameters(part), lr=learning_rate, fused=True)
+            for part in ("actor", "critic")
+        }
+
+    def update(
+        self, batch: TensorDictBase, *, key: Sequence[int | str], progress: float = 0.0
+    ) -> dict[str, float]:
+        """Take in ``batch``, improve actor and critics from the replay buffer, report.
+
+        Args:
+            batch: What a collector brings: batch size ``[N, T]``, rows of whole episodes.
+            key: What this update is, such as ``(round, iteration)``: what is replayed depends on
+                it and on the seed alone.
+            progress: Share of the training that is over, for the learning rate.
+
+        Returns:
+            Means over the updates of the losses; their number; the learning rate.
+
+        Raises:
+            ValueError: The batch lacks an entry, its rows are no whole episodes, or the replay
+                buffer holds less than one batch.
+            SimulationError: A value in the batch or a loss is not finite. The networks are then
+                as they were before.
+        """
+        self._check(batch)
+        kept = batch.select(*self._kept_keys)
+        before = copy.deepcopy(self._learned())
+        try:
+            with isolated(self.seed, "ddpg update", *key):
+                self.buffer.extend(kept)
+                self.state.observe(kept)
+                return self._optimise(round(self.updates_per_frame * batch.numel()), progress)
+        except SimulationError:
+            self._learn(before)
+            raise
+
+    def _check(self, batch: TensorDictBase) -> None:
+        for key in self._kept_keys:
+            value = batch.get(key, None)
+            if value is None:
+                available = sorted(map(str, batch.keys(include_nested=True)))
+                raise ValueError(
+                    message("a batch of a goal environment", f"no {key!r}", available=available)
+                )
+            if value.is_floating_point() and not value.isfinite().all():
+                raise SimulationError(
+                    message(f"finite {key!r} in the batch", "NaN or infinity in some frames")
+                )
+
+    @property
+    def _kept_keys(self) -> list[Any]:
+        states = [*GOAL_KEYS, *self.state.critic_keys]
+        following = [("next", key) for key in (*states, "reward", "done", "terminated")]
+        return [*states, "action", *following]
+
+    def _optimise(self, updates: int, progress: float) -> dict[str, float]:
+        if len(self.buffer) < self.batch_size:
+            raise ValueError(
+                message(
+                    f"a replay buffer that holds at least one batch of {self.batch_size}",
+                    len(self.buffer),
+                    hint="more environments, or a smaller batch_size",
+                )
+            )
+        rate = self._set_learning_rate(progress)
+        sums = {"actor": 0.0, "critic": 0.0}
+        for index, steps in enumerate(self._replayed(updates)):
+            sums["critic"] += self._step("critic", self._loss.critic_loss(steps))
+            if (index + 1) % self._actor_every == 0:
+                sums["actor"] += self._step("actor", self._loss.policy_loss(steps))
+            self._targets.step()
+        counts = {"actor": updates // self._actor_every, "critic": updates}
+        means = {f"loss_{part}": sums[part] / max(1, counts[part]) for part in sums}
+        return means | {"updates": float(updates), "learning_rate": rate}
+
+    def _replayed(self, updates: int) -> Iterator[TensorDictBase]:
+        """Yield batches as the losses read them; a few hundred are sampled in one go."""
+        low, high = self._bounds
+        for first in range(0, updates, _AT_ONCE):
+            count = min(_AT_ONCE, updates - first)
+            sample = self.buffer.sample(count * self.batch_size)
+            after: Any = sample["next"]
+            steps = TensorDict(
+                {
+                    "state": self.state.full(sample),
+                    "action": 2 * (sample["action"] - low) / (high - low) - 1,
+                    "next": {
+                        "state": self.state.full(after),
+                        **{key: after[key] for key in ("reward", "done", "terminated")},
+                    },
+                },
+                batch_size=sample.batch_size,
+            )
+            # relabelled ones come first in the sample
+            yield from steps[torch.randperm(len(steps))].split(self.batch_size)
+
+    def _step(self, part: str, loss: Tensor) -> float:
+        value = loss.item()
+        if not math.isfinite(value):
+            raise SimulationError(
+                message(
+                    f"a finite loss of the {part}",
+                    value,
+                    hint="a smaller learning rate, or rewards within the given range",
+                )
+            )
+        self._optimizers[part].zero_grad()
+        loss.backward()
+        self._optimizers[part].step()
+        return value
+
+    def _set_learning_rate(self, progress: float) -> float:
+        first, last, start = self._rates
+        over = min(max((progress - start) / max(1 - start, 1e-9), 0.0), 1.0)
+        rate = first + over * (last - first)
+        for optimizer in self._optimizers.values():
+            for group in optimizer.param_groups:
+                group["lr"] = rate
+        return rate
+
+    def _parameters(self, part: str) -> list[nn.Parameter]:
+        own = {"actor": "actor_network_params", "critic": "value_network_params"}[part]
+        return [p for name, p in self._loss.named_parameters() if own in name and p.requires_grad]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return networks, statistics, optimisers and replay buffer, for `load_state_dict`."""
+        return self._learned() | {"buffer": self.buffer.contents()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from ``state``."""
+        self._learn(state)
+        self.buffer.restore(state["buffer"])
+
+    def _learned(self) -> dict[str, Any]:
+        return {
+            "networks": self._tensors(),
+            "state": dict(self.state.state_dict()),
+            "optimizers": {part: o.state_dict() for part, o in self._optimizers.items()},
+        }
+
+    def _learn(self, state: Mapping[str, Any]) -> None:
+        with torch.no_grad():
+            for name, tensor in self._tensors().items():
+                tensor.copy_(state["networks"][name])
+        self.state.load_state_dict(state["state"])
+        for part, optimizer in self._optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][part])
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """Return the parameters of networks and target networks, in place."""
+        sources = dict(self._loss.named_parameters()) | dict(self._loss.named_buffers())
+        return {name: value.data for name, value in sources.items() if "network_params" in name}
