@@ -5,6 +5,9 @@ import pytest
 from torchrl_bayessim.envs.model_batch import ModelBatch
 from torchrl_bayessim.envs.stepper import Stepper
 from torchrl_bayessim.errors import PhysicsError, SimulationError
+from torchrl_bayessim.physics.assignments import assignments
+from torchrl_bayessim.physics.model_fields import resolve
+from torchrl_bayessim.physics.mujoco_models import MujocoModels
 
 ARM = """
 <mujoco>
@@ -178,6 +181,20 @@ def test_threads_refresh_what_one_thread_does(threads):
         models.refresh()
     np.testing.assert_array_equal(several.table, one.table)
     assert len(np.unique(several.read("body_subtreemass", (1,)))) == 100
+
+
+def test_parameters_are_assigned_to_the_rows_of_a_mask():
+    models = ModelBatch(model(), 3)
+    entries = assignments(MujocoModels(model(), models), [[resolve(model(), "body_mass[1]")]])
+    rows = np.array([True, False, True])
+    models.assign(entries, np.array([[4.0], [5.0], [np.nan]]), rows)
+    mass, inertia = model().body_mass[1], model().body_inertia[1, 0]
+    assert models.read("body_mass", (1,)).tolist() == [4.0, mass, mass]
+    assert models.read("body_inertia", (1, 0)).tolist() == [inertia * (4 / mass), inertia, inertia]
+    models.assign(entries, np.full((3, 1), mass), rows)  # nominal again, to the last bit
+    assert (models.read("body_inertia", (1, 0)) == inertia).all()
+    with pytest.raises(ValueError, match=r"a mask of 3 environments, got '\(2, 1\) and \(3,\)'"):
+        models.assign(entries, np.zeros((2, 1)), rows)
 
 
 def test_repeated_physics_keep_their_columns():

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PhysicsError, message
+from ..physics.assignments import Assignments
 from ..physics.frames import separate
 from . import native
 
@@ -108,6 +109,7 @@ class ModelBatch:
         self.num_envs = num_envs
         self.table: NDArray[np.float64] = np.empty((num_envs, 0))
         self._columns: dict[tuple[str, tuple[int, ...]], int] = {}
+        self._places: dict[Assignments, NDArray[np.int64]] = {}
         self._scratch: list[_Scratch] = []
         self._pool: ThreadPoolExecutor | None = None
 
@@ -148,6 +150,33 @@ class ModelBatch:
         else:
             expected = f"a mask of environments, shape ({self.num_envs},)"
             raise ValueError(message(expected, np.shape(rows)))
+
+    def assign(
+        self, entries: Assignments, theta: NDArray[np.float64], rows: NDArray[np.bool_]
+    ) -> None:
+        """Set entries from parameters ``theta``, shape ``(N, D)``, in the environments ``rows``.
+
+        Raises:
+            ValueError: ``theta`` or ``rows`` are for another number of environments.
+        """
+        if not len(theta) == len(rows) == self.num_envs:
+            expected = f"parameters and a mask of {self.num_envs} environments"
+            raise ValueError(message(expected, f"{theta.shape} and {rows.shape}"))
+        places = self._columns_of(entries)
+        native.assign(self.table, rows, theta, places, entries.numbers)
+
+    def held(self, entries: Assignments) -> NDArray[np.float64]:
+        """Return the entries' values as parameters, so without their signs, shape ``(N, P)``."""
+        columns = self._columns_of(entries)[:, 1]
+        return self.table[:, columns] * np.sign(entries.numbers[:, 0])
+
+    def _columns_of(self, entries: Assignments) -> NDArray[np.int64]:
+        """Return columns of θ and of the table, shape ``(P, 2)``."""
+        known = self._places.get(entries)
+        if known is None:
+            columns = [self.column(*place) for place in entries.places]
+            known = self._places[entries] = np.stack([entries.parameter, columns], -1)
+        return known
 
     def read(self, field: str, indices: tuple[int, ...]) -> NDArray[np.float64]:
         """Return one entry of the model in every environment, shape ``(N,)``."""

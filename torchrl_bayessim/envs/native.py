@@ -25,7 +25,7 @@ The arguments of the kernels, as `Stepper` builds them:
 
 from __future__ import annotations
 
-__all__ = ["DIVERGED", "OVERFLOW", "OWNED", "advance", "begin", "override", "refresh"]
+__all__ = ["DIVERGED", "OVERFLOW", "OWNED", "advance", "assign", "begin", "override", "refresh"]
 
 import math
 
@@ -69,6 +69,17 @@ def override(addresses, table, i):
     """Write row ``i`` of the table into a model."""
     for j in range(addresses.shape[0]):
         doubles(addresses[j])[0] = table[i, j]
+
+
+@compiled
+def assign(table, rows, theta, places, numbers):
+    """Write the entries of ``rows``, a mask, that follow from parameters; see `Assignments`."""
+    for i in range(rows.shape[0]):
+        if rows[i]:
+            for p in range(places.shape[0]):
+                value = theta[i, places[p, 0]]
+                base, scale, nominal = numbers[p]
+                table[i, places[p, 1]] = nominal if math.isnan(value) else base * (value / scale)
 
 
 @compiled

@@ -15,18 +15,16 @@ from __future__ import annotations
 
 __all__ = ["DERIVED_FROM", "MujocoPhysics"]
 
-from typing import Any
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ..errors import PhysicsError, message
+from ..errors import message
+from .assignments import Assignments, assignments
 from .geom_bounds import fit_bounds
-from .model_fields import Entries, resolve
+from .model_fields import resolve
 from .mujoco_models import MujocoModels, models_of
 
 # Fields from which mj_setConst derives others (inverse weights, subtree masses, lengths at qpos0).
@@ -90,51 +88,35 @@ class MujocoPhysics:
         """Set the entries of the environments in ``mask``, then what is derived from them."""
         del tensordict
         models, entries = self._resolved(env)
-        values = theta.reshape(-1, len(self.names)).to(torch.float64).numpy()
-        rows = mask.reshape(-1).numpy()
-        # Masses first: they scale inertias, which may be parameters themselves.
-        todo = [(e, values[:, i]) for i, group in enumerate(entries) for e in group]
-        for entry, value in sorted(todo, key=lambda pair: pair[0].field != "body_mass"):
-            for indices in entry.indices:
-                nominal = models.nominal(entry.field, indices)
-                new = np.where(np.isnan(value), nominal, entry.sign * value)
-                models.write(entry.field, indices, new, rows)
-                if entry.field == "body_mass":
-                    _scale_inertia(models, indices[0], new, rows)
-                elif entry.field == "geom_size":
-                    fit_bounds(models, indices[0], rows)
-        if any(entry.field in DERIVED_FROM for entry, _ in todo):
+        values = theta.numpy().astype(np.float64, copy=False).reshape(-1, len(self.names))
+        rows = mask.numpy().reshape(-1)
+        models.assign(entries, values, rows)
+        for geom in entries.sized:
+            fit_bounds(models, geom, rows)
+        if not DERIVED_FROM.isdisjoint(entries.fields):
             models.refresh(rows)
 
     def read(self, env: EnvBase, *, tensordict: TensorDictBase) -> Tensor:
         """Return the entries' values, shape ``(*batch, D)``."""
         del tensordict
         models, entries = self._resolved(env)
+        held = models.held(entries)
         columns = []
-        for group in entries:
-            held = np.stack([e.sign * models.read(e.field, i) for e in group for i in e.indices])
-            # not np.isclose, which takes longer than all else here
-            same = (np.abs(held - held[0]) <= 1e-9 * np.abs(held[0])).all(0)
-            columns.append(np.where(same, held[0], np.nan))
+        for group in entries.groups:
+            first = held[:, group[0]]
+            if len(group) > 1:
+                others = held[:, group]
+                # not np.isclose, which takes longer than all else here
+                same = np.abs(others - first[:, None]) <= 1e-9 * np.abs(first)[:, None]
+                first = np.where(same.all(1), first, np.nan)
+            columns.append(first)
         return torch.from_numpy(np.stack(columns, -1)).reshape(*getattr(env, "batch_size", ()), -1)
 
-    def _resolved(self, env: EnvBase) -> tuple[Any, list[list[Entries]]]:
+    def _resolved(self, env: EnvBase) -> tuple[MujocoModels, Assignments]:
         """Return the models and this adapter's entries of them, resolved once per model."""
         models = models_of(env)
         known = models.resolved.get(self._targets)
         if known is None:
-            known = [[resolve(models.model, t) for t in group] for group in self._targets]
-            models.resolved[self._targets] = known
+            groups = [[resolve(models.model, t) for t in group] for group in self._targets]
+            known = models.resolved[self._targets] = assignments(models, groups)
         return models, known
-
-
-def _scale_inertia(
-    models: MujocoModels, body: int, mass: NDArray[np.float64], rows: NDArray[np.bool_]
-) -> None:
-    """Keep a body's shape: its inertia is proportional to its mass."""
-    nominal = models.nominal("body_mass", (body,))
-    if nominal == 0:
-        raise PhysicsError(message("a body that has a nominal mass, to scale its inertia", body))
-    for axis in range(3):
-        inertia = models.nominal("body_inertia", (body, axis))
-        models.write("body_inertia", (body, axis), inertia * (mass / nominal), rows)

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PhysicsError, message
+from .assignments import Assignments
 from .frames import separate
-from .model_fields import Entries
 
 
 class MujocoModels:
@@ -20,12 +20,12 @@ class MujocoModels:
 
     Attributes:
         model: The one model, or the batched environment's nominal one.
-        resolved: Entries by the targets that they were resolved from.
+        resolved: What to set, by the targets that it was resolved from.
     """
 
     def __init__(self, model: mujoco.MjModel, batch: Any = None) -> None:
         self.model, self._batch = model, batch
-        self.resolved: dict[tuple[tuple[str, ...], ...], list[list[Entries]]] = {}
+        self.resolved: dict[tuple[tuple[str, ...], ...], Assignments] = {}
         self._nominal: dict[str, NDArray[np.float64]] = {}
         self._scratch: mujoco.MjData | None = None
 
@@ -53,12 +53,34 @@ class MujocoModels:
             self._batch.write(field, indices, values, rows)
         elif rows.all():
             self.nominal(field, indices)
-            if indices:
-                _let_move(self.model, field, indices[0])
-            if indices:
-                _array(self.model, field)[indices] = values[0]
-            else:
-                setattr(self.model.opt, field.removeprefix("opt."), float(values[0]))
+            self._set(field, indices, float(values[0]))
+
+    def _set(self, field: str, indices: tuple[int, ...], value: float) -> None:
+        if indices:
+            _let_move(self.model, field, indices[0])
+            _array(self.model, field)[indices] = value
+        else:
+            setattr(self.model.opt, field.removeprefix("opt."), value)
+
+    def assign(
+        self, entries: Assignments, theta: NDArray[np.float64], rows: NDArray[np.bool_]
+    ) -> None:
+        """Set what follows from ``theta``, shape ``(N, D)``, in the environments ``rows``."""
+        if self._batch is not None:
+            self._batch.assign(entries, theta, rows)
+        elif rows.all():
+            base, scale, nominal = entries.numbers.T
+            new = base * (theta[0, entries.parameter] / scale)
+            new = np.where(np.isnan(new), nominal, new)
+            for (field, indices), value in zip(entries.places, new.tolist(), strict=True):
+                self._set(field, indices, value)
+
+    def held(self, entries: Assignments) -> NDArray[np.float64]:
+        """Return the entries' values as parameters, so without their signs, shape ``(N, P)``."""
+        if self._batch is not None:
+            return self._batch.held(entries)
+        values = [_array(self.model, field)[indices] for field, indices in entries.places]
+        return np.array([values]) * np.sign(entries.numbers[:, 0])
 
     def refresh(self, rows: NDArray[np.bool_]) -> None:
         """Recompute what MuJoCo derives from other entries (``mj_setConst``)."""
