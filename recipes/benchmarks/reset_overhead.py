@@ -2,9 +2,10 @@
 
 Frames per second of a collector with the two transforms (a mass and two frictions drawn, written,
 read back at every reset), over the same collector without them, with episodes of 100 steps:
-``GymEnv``, ``SerialEnv`` of four, and ``BatchedMujocoEnv`` of 64. ``plain`` has no transform beside
-the simulator, ``idle`` transforms that do nothing in the places of the two: what a step costs more
-with any transform there is TorchRL's. Prints one JSON line per case::
+``GymEnv``, ``SerialEnv`` of four bare simulators and of four that have another transform beside
+them already, and ``BatchedMujocoEnv`` of 64. ``plain`` has neither of the two, ``idle`` transforms
+that do nothing in their places: what a step costs more with any transform there is TorchRL's.
+Prints one JSON line per case::
 
     python recipes/benchmarks/reset_overhead.py [runs=7] [steps=100] [frames=4000]
 """
@@ -72,18 +73,27 @@ def single(case: str, *, steps: int) -> EnvBase:
     return TransformedEnv(hopper(), Compose(*beside, StepCounter(steps), DoubleToFloat()))
 
 
-def serial(case: str, *, steps: int) -> EnvBase:
+def bare(case: str, *, steps: int) -> EnvBase:
     """Return four environments, with the randomizer outside."""
     beside = {"plain": None, "idle": Idle, "randomized": apply}[case]
     make = hopper if beside is None else lambda: TransformedEnv(hopper(), beside())
-    outside: list[Transform] = {
+    return _outside(SerialEnv(4, make), case, StepCounter(steps), DoubleToFloat())
+
+
+def transformed(case: str, *, steps: int) -> EnvBase:
+    """Return four environments that have a transform of their own already."""
+    beside = {"plain": list, "idle": lambda: [Idle()], "randomized": lambda: [apply()]}[case]
+    make = lambda: TransformedEnv(hopper(), Compose(*beside(), DoubleToFloat()))
+    return _outside(SerialEnv(4, make), case, StepCounter(steps))
+
+
+def _outside(env: EnvBase, case: str, *others: Transform) -> EnvBase:
+    first: dict[str, list[Transform]] = {
         "plain": [],
         "idle": [Idle()],
         "randomized": [DomainRandomizer(PRIOR)],
-    }[case]
-    return TransformedEnv(
-        SerialEnv(4, make), Compose(*outside, StepCounter(steps), DoubleToFloat())
-    )
+    }
+    return TransformedEnv(env, Compose(*first[case], *others))
 
 
 def batched(case: str, *, steps: int) -> EnvBase:
@@ -110,10 +120,16 @@ def collect(collector: Collector, frames: int) -> int:
 
 
 def main(*arguments: str) -> None:
-    """Measure the three kinds of environment, with and without randomisation."""
+    """Measure every kind of environment, with and without randomisation."""
     given = options(list(arguments), runs=7, steps=100, frames=4000)
     torch.set_num_threads(1)
-    for name, make in {"GymEnv": single, "SerialEnv": serial, "BatchedMujocoEnv": batched}.items():
+    kinds = {
+        "GymEnv": single,
+        "SerialEnv": bare,
+        "SerialEnv, transformed": transformed,
+        "BatchedMujocoEnv": batched,
+    }
+    for name, make in kinds.items():
         cases: dict[str, Callable[[], int]] = {}
         for case in ("plain", "idle", "randomized"):
             env = make(case, steps=given["steps"])
