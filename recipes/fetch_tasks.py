@@ -1,0 +1,157 @@
+"""Fetch tasks of the recipes: simulator, prior, hidden truth, summaries, and DDPG's settings.
+
+Friction is set on table and object under one name: MuJoCo takes the larger of two geoms' friction,
+so that of the object alone changes nothing on a table of 1.0. The prior of friction is that of the
+BayesSim paper (arXiv:1906.01728, sec. V). It does not state the true friction; here it lies inside
+the prior, where the object moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from tasks import Task
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchrl_bayessim.agents.ddpg import DDPG
+from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+from torchrl_bayessim.envs.tasks.fetch import goal_reward
+from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.physics.mujoco import MujocoPhysics
+from torchrl_bayessim.summaries import cross_correlation, linear_dynamics
+
+MEASURED = ("observation", "achieved_goal", "desired_goal")
+FRICTION = ("geom_friction[body:table0,0]", "geom_friction[object0,0]")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GoalTask(Task):
+    """A task whose episodes have goals and last ``max_steps``.
+
+    Attributes:
+        simulator_name: Under which the simulator knows it.
+        warmup: Batches under the prior that make the data-collecting policy.
+        budget: Batches in a training of its own, as `robustness.py` has them.
+        ddpg: DDPG's settings.
+    """
+
+    simulator_name: str
+    warmup: int
+    budget: int
+    ddpg: Mapping[str, Any] = field(default_factory=dict)
+
+    def learner(self, env: EnvBase, **options: Any) -> DDPG:
+        """Return an untrained learner."""
+        return DDPG(env, goal_reward, **{**self.ddpg, **options})
+
+
+def goal_task(simulator_name: str, **settings: Any) -> GoalTask:
+    """Return a task of the batched Fetch environment, on one thread."""
+    return GoalTask(
+        simulator_name=simulator_name,
+        simulator=lambda n, seed: BatchedMujocoEnv(simulator_name, n, seed=seed, threads=1),
+        **{"max_steps": 50, "horizon": 50, "environments": 16, "shared_batches": 8, **settings},
+    )
+
+
+def sliding(state: Tensor, action: Tensor, next_state: Tensor, mask: Tensor) -> Tensor:
+    """Return how objects that move come to rest, shape ``(*, 10)``.
+
+    Free sliding loses ``μ g Δt`` of speed per control step. Over the steps at whose start the
+    object moves faster than 2 cm/s, pushed or not: their share, mean speed, mean loss, its mean
+    square, five quantiles of it, and the ratio of summed losses to summed speeds.
+    """
+    del action
+    before, after = (_object_speed(x) for x in (state, next_state))
+    moving = mask & (before > 0.02 * 0.04)
+    loss = torch.where(moving, before - after, torch.nan)
+    speed = torch.where(moving, before, torch.nan)
+    grid = torch.tensor([0.1, 0.3, 0.5, 0.7, 0.9])
+    quantiles = loss.nanquantile(grid, dim=-1).movedim(0, -1)
+    parts = [speed.nanmean(-1), loss.nanmean(-1), loss.square().nanmean(-1).sqrt()]
+    ratio = loss.nansum(-1) / speed.nansum(-1).clamp(min=1e-9)
+    share = moving.sum(-1) / mask.sum(-1)
+    values = torch.stack([share, *(100 * part for part in parts), ratio], -1)
+    return torch.cat([values, 100 * quantiles], -1).nan_to_num(0.0)
+
+
+def _object_speed(state: Tensor) -> Tensor:
+    """Return the object's horizontal speed in m per control step, ``(*, 25) -> (*,)``."""
+    # the observation holds it relative to the gripper's
+    return torch.linalg.vector_norm(state[..., 14:16] + state[..., 20:22], dim=-1)
+
+
+def gripper_dynamics(state: Tensor, action: Tensor, next_state: Tensor, mask: Tensor) -> Tensor:
+    """Return the linear dynamics of the gripper's position and velocity, given the command."""
+    columns = [0, 1, 2, 5, 6, 7]
+    return linear_dynamics(state[..., columns], action[..., :3], next_state[..., columns], mask)
+
+
+def pushes(state: Tensor, action: Tensor, next_state: Tensor, mask: Tensor) -> Tensor:
+    """Return how the object's displacement goes with hand and object, as correlations."""
+    columns = [3, 4, 6, 7, 8, 14, 15]
+    return cross_correlation(state[..., columns], action[..., :3], next_state[..., columns], mask)
+
+
+FETCH: dict[str, GoalTask] = {
+    "fetch_push": goal_task(
+        "FetchPush-v4",
+        prior=BoxPrior({"friction": (0.1, 1.0)}),
+        truth={"friction": 0.3},
+        physics=lambda: MujocoPhysics(friction=FRICTION),
+        summaries=(sliding, pushes),
+        warmup=250,
+        updates=125,
+        budget=500,
+    ),
+    "fetch_slide": goal_task(
+        "FetchSlide-v4",
+        prior=BoxPrior({"friction": (0.1, 1.0)}),
+        truth={"friction": 0.15},
+        physics=lambda: MujocoPhysics(friction=FRICTION),
+        summaries=(sliding, pushes),
+        warmup=300,
+        updates=150,
+        budget=600,
+        ddpg={"algorithm": "td3", "final_learning_rate": 3e-4},
+    ),
+    "fetch_reach": goal_task(
+        "FetchReach-v4",
+        prior=BoxPrior({"damping": (10.0, 200.0)}, units={"damping": "N m s/rad"}),
+        truth={"damping": 50.0},
+        physics=lambda: MujocoPhysics(damping="dof_damping[robot0:shoulder_pan_joint]"),
+        summaries=(gripper_dynamics,),
+        warmup=8,
+        updates=8,
+        budget=24,
+        shared_batches=1,
+    ),
+}
+
+# Plappert et al. (2018), one worker: 200 epochs of 100 episodes, 400,000 updates. Target networks
+# there keep 0.95 once in 40 updates, here as much at every one.
+PAPER = {
+    "algorithm": "ddpg",
+    "updates_per_frame": 0.4,
+    "tau": 1 - 0.95 ** (1 / 40),
+    "moving": None,
+    "final_learning_rate": 1e-3,
+}
+
+
+def paper(task: GoalTask, rounds: int) -> GoalTask:
+    """Return the task with the original settings and 1,000,000 frames in ``rounds`` rounds."""
+    batches = 10_000  # of two episodes
+    warmup = batches // 2
+    return replace(
+        task,
+        environments=2,
+        warmup=warmup,
+        updates=(batches - warmup) // rounds,
+        budget=batches,
+        ddpg={**PAPER},
+    )

@@ -1,0 +1,72 @@
+"""A policy on film: gymnasium-robotics renders, TorchRL's recorder records, Pillow writes a GIF."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import gymnasium_robotics
+import torch
+from fetch_tasks import GoalTask
+from torch import Tensor
+from torchrl.envs import Compose, DoubleToFloat, GymEnv, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.record import VideoRecorder
+from torchrl.record.loggers import Logger
+
+from torchrl_bayessim.sources import Grid
+from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
+
+
+class GifLogger(Logger):
+    """Keeps what `VideoRecorder` hands on as a GIF; TorchRL's own loggers need more packages."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(exp_name=path.stem, log_dir=str(path.parent))
+        self.path = path
+
+    def log_video(self, name: str, video: Tensor, step: int | None = None, **_: Any) -> None:
+        """Write a video of shape ``(1, T, 3, H, W)``, uint8, 25 pictures a second."""
+        from PIL import Image
+
+        del name, step
+        frames = [Image.fromarray(f.permute(1, 2, 0).numpy()) for f in video[0]]
+        first, *others = [f.quantize(64) for f in frames]
+        first.save(self.path, save_all=True, append_images=others, duration=40, loop=0)
+
+    def log_scalar(self, *args: Any, **options: Any) -> None:
+        """Keep nothing: this logger is for videos, as the others below."""
+
+    log_hparams = log_histogram = _create_experiment = log_scalar
+
+    def __repr__(self) -> str:
+        return f"GifLogger({self.path})"
+
+
+def record(
+    task: GoalTask, policy: Any, theta: Tensor, path: Path, *, episodes: int = 4, size: int = 240
+) -> str | None:
+    """Film episodes at given physics; return the file, or None where nothing can be rendered."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    gymnasium.register_envs(gymnasium_robotics)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            name, shape = task.simulator_name, {"width": size, "height": size}
+            filmed = GymEnv(name, from_pixels=True, pixels_only=False, **shape)
+    except Exception as error:
+        print(f"no video: {type(error).__name__}: {error}")
+        return None
+    recorder = VideoRecorder(GifLogger(path), tag=path.stem, skip=1)
+    physics = ApplyPhysics(task.physics()), DomainRandomizer(Grid(theta[None]))
+    env = TransformedEnv(filmed, Compose(*physics, DoubleToFloat(), recorder))
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        env.set_seed(0)
+        for _ in range(episodes):
+            env.rollout(task.max_steps, policy)
+    recorder.dump()
+    env.close()
+    return str(path)

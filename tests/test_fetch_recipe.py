@@ -1,0 +1,150 @@
+"""The Fetch job as users run it, on the smallest task."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+RECIPES = Path(__file__).parent.parent / "recipes"
+TINY = ["task=fetch_reach", "short=true", "progress=false", "rounds=1", "simulations=8"]
+
+
+@pytest.fixture(scope="module")
+def recipes():
+    """Make the recipes importable, and clean up after."""
+    sys.path.insert(0, str(RECIPES))
+    yield
+    sys.path.remove(str(RECIPES))
+
+
+@pytest.fixture(scope="module")
+def run(recipes):
+    import recipe
+    import sim2real_ddpg_her
+
+    def run(*arguments):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "argv", ["sim2real_ddpg_her.py", *arguments])
+            recipe.main(sim2real_ddpg_her.Sim2RealFetch, sim2real_ddpg_her.job)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def finished(run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("fetch")
+    run(*TINY, "critic_sees_physics=true", "algorithm=td3", f"out={folder}")
+    return folder
+
+
+def test_the_result_has_what_others_read(finished):
+    result = json.loads((finished / "result.json").read_text())
+    assert {"task", "parameters", "true", "rounds", "baseline", "checkpoint"} <= result.keys()
+    assert result["algorithm"] == "TD3+HER"
+    assert result["parameters"] == ["damping"]
+    (entry,) = result["rounds"]
+    assert entry.keys() == {
+        *("round", "posterior_mean", "posterior_sd", "log_prob_true", "nats_over_prior"),
+        *("real_return", "real_return_ci", "sim_return", "frames", "simulations", "seconds"),
+    }
+    assert entry["frames"] == 8 * 50 * (2 + 1)  # two batches, and one that inference shared
+    assert 10 <= entry["posterior_mean"][0] <= 200
+    low, high = entry["real_return_ci"]
+    assert 0 <= low <= entry["real_return"] <= high <= 1
+    assert result["gain"].keys() == {"real_return", "real_return_ci"}
+
+
+def test_pictures_and_the_film_are_drawn(finished):
+    from matplotlib.image import imread
+
+    for name in ("posterior", "return"):
+        assert imread(finished / f"{name}.png")[..., :3].std() > 0.01
+    film = json.loads((finished / "result.json").read_text())["video"]
+    if film is None:
+        pytest.skip("nothing renders here")
+    from PIL import Image
+
+    with Image.open(film) as pictures:
+        assert pictures.n_frames > 4 * 50
+        first = np.asarray(pictures.convert("L"))
+        pictures.seek(30)
+        moved = np.asarray(pictures.convert("L"))
+    assert first.std() > 5
+    assert (first != moved).any()
+
+
+def test_a_finished_run_resumes_to_the_same_result(finished, run):
+    earlier = json.loads((finished / "result.json").read_text())
+    run(f"resume={finished}", "progress=false")
+    again = json.loads((finished / "result.json").read_text())
+    del earlier["provenance"], again["provenance"]
+    assert again == earlier
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("task=fetch_pusk", "got 'fetch_pusk'. Available: fetch_push (did you mean this?)"),
+        ("preset=papr", "got 'papr'. Available: paper (did you mean this?)"),
+        ("algorithm=td4", "got 'td4'. Available: td3 (did you mean this?)"),
+        ("truth=true", "expected a truth, got 'True'"),
+    ],
+)
+def test_bad_settings_are_explained(arguments, said, run, capsys, tmp_path_factory):  # noqa: PLR0917
+    with pytest.raises(SystemExit, match="2"):
+        run("short=true", arguments, f"out={tmp_path_factory.mktemp('bad')}")
+    (line,) = [x for x in capsys.readouterr().err.splitlines() if x.startswith("sim2real")]
+    assert said in line
+
+
+def test_the_paper_preset_has_the_original_budget(recipes):
+    from sim2real_ddpg_her import Sim2RealFetch, chosen
+
+    task = chosen(Sim2RealFetch(preset="paper", rounds=2))
+    batches = task.warmup + 2 * task.updates
+    assert batches * task.environments == 200 * 100
+    assert batches * task.environments * task.horizon * task.ddpg["updates_per_frame"] == 400_000
+    assert (1 - task.ddpg["tau"]) ** 40 == pytest.approx(0.95)
+
+
+def test_training_goes_on_from_its_checkpoint_to_the_same_numbers(recipes, tmp_path):
+    from fetch_tasks import FETCH
+    from training import Plan, train
+
+    from torchrl_bayessim.transforms import DomainRandomizer
+
+    task = FETCH["fetch_reach"]
+
+    def trained(file, stop_at=None):
+        randomizer = DomainRandomizer(task.prior)
+        env = task.make(2, seed=0, randomizer=randomizer)
+        small = {"hidden": (16,), "batch_size": 32, "updates_per_frame": 0.02}
+        learner = task.learner(env, seed=0, **small)
+        calls = []
+
+        def score(policy):
+            calls.append(policy)
+            if len(calls) == stop_at:
+                raise KeyboardInterrupt
+            return -abs(len(calls) - 2.0)
+
+        plan = Plan(5, task.horizon, keep_every=2, score_every=1, file=file)
+        return train(learner, env, randomizer, plan, key=(0,), score=score, progress=False), learner
+
+    whole, learner = trained(None)
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path / "kept.pt", stop_at=4)  # in the second chunk of two batches
+    resumed, again = trained(tmp_path / "kept.pt")
+    timed = ("seconds", "cpu_seconds", "score", "return")
+    strip = [
+        [{k: v for k, v in p.items() if k not in timed} for p in t.curve] for t in (whole, resumed)
+    ]
+    assert strip[0] == strip[1]
+    assert len(whole.curve) == 5
+    for name, value in learner.policy.state_dict().items():
+        assert torch.equal(value, again.policy.state_dict()[name])
+    # the second score was the best
+    assert not all(torch.equal(v, learner.policy.state_dict()[n]) for n, v in whole.best.items())
