@@ -152,6 +152,7 @@ def test_a_divergence_stays_with_its_simulation():
     ("change", "error", "match"),
     [
         ({"qpos": torch.zeros(2, 1)}, ValueError, r"finite numbers for 3 segments in 'qpos'"),
+        ({"qpos": torch.zeros(3, 2)}, ValueError, r"qpos of shape \(3, 1\), got \(3, 2\)"),
         ({"qvel": torch.full((3, 1), torch.nan)}, ValueError, "finite numbers .* 'qvel'"),
         ({"action": torch.zeros(3, 1)}, ValueError, r"actions of shape \(S, T, A\)"),
         ({"action": torch.zeros(3, 4, 2)}, ValueError, r"commands of shape \(B, T, 1\)"),

@@ -175,6 +175,8 @@ def test_a_value_that_is_not_finite_is_found(name, value):
 
 
 def test_empty_logs_are_refused():
+    with pytest.raises(TypeError, match=r"\[n, T\] in a TensorDict, got 'list'\. Try: pad"):
+        RecordedLogs([log(3)])
     logs = pad([log(3), log(2)])
     with pytest.raises(ValueError, match="at least one step each"):
         RecordedLogs(logs.set("mask", logs["mask"] & torch.tensor([[True], [False]])))

@@ -383,6 +383,16 @@ def test_other_keys_may_be_named():
 def test_no_summary_is_refused():
     with pytest.raises(ValueError, match="at least one summary"):
         SummaryStatistics()
+    with pytest.raises(TypeError, match=r"functions of .* got 'moments'\. Try: summaries\."):
+        SummaryStatistics("moments")
+
+
+def test_trajectories_that_lack_an_entry_or_a_step_are_refused():
+    rows = CartPoleEnv(2).rollout(5, break_when_any_done=False)
+    with pytest.raises(KeyError, match=r"with an entry, got 'obs'\. Available: observation"):
+        SummaryStatistics(moments, observation_key="obs")(rows)
+    with pytest.raises(ValueError, match=r"at least one step, got 'batch size \(2, 0\)'"):
+        SummaryStatistics(moments)(rows[:, :0])
 
 
 def test_angles_are_wrapped_for_every_summary():

@@ -335,6 +335,14 @@ def test_bad_theta_is_refused():
     env = with_randomizer(randomizer)
     with pytest.raises(ValueError, match="a source of 2 parameters"):
         env.reset()
+    with pytest.raises(TypeError, match=r"numbers to pin, .* got {'length': 0\.5}"):
+        randomizer.pin({"length": 0.5})
+
+
+@pytest.mark.parametrize("physics", ["length", Uniform, None])
+def test_what_is_no_physics_is_refused(physics):
+    with pytest.raises(TypeError, match=r"physics with names, write and read.* Try: Attribute"):
+        ApplyPhysics(physics)
 
 
 class ForgetfulPhysics(AttributePhysics):

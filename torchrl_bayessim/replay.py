@@ -209,6 +209,10 @@ class Replay:
         own = {} if reset is None else reset(Draws(0, np.zeros(1, int), np.zeros(1, int)))
         for name, value in {**self.task.initial, **given}.items():
             if name in components:
+                if value.shape[1:] != self._starts[:, components[name]].shape[1:]:
+                    size = self._starts[:, components[name]].shape[1]
+                    expected = f"{name} of shape ({self.num_segments}, {size})"
+                    raise ValueError(message(expected, tuple(value.shape)))
                 self._starts[:, components[name]] = value
             elif name in own:
                 self._extras[name] = torch.as_tensor(value).unsqueeze(1)

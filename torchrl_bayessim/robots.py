@@ -177,17 +177,24 @@ class RecordedLogs:
         trajectories: Batch size ``[n, T]`` with a ``"mask"``: see :func:`.trajectories.pad`.
 
     Raises:
+        TypeError: For what is not a TensorDict.
         ValueError: For no trajectory, missing entries, or measurements that are not finite.
     """
 
     recorded = True
 
     def __init__(self, trajectories: TensorDictBase) -> None:
+        if not isinstance(trajectories, TensorDictBase):
+            got = type(trajectories).__name__
+            raise TypeError(message("trajectories [n, T] in a TensorDict", got, hint="pad(logs)"))
         for name in ("observation", "action", ("next", "observation"), "mask"):
             value = trajectories.get(name, None)
             if value is None:
                 found = sorted(map(str, trajectories.keys(include_nested=True)))
-                raise ValueError(message("logs with an entry", str(name), available=found))
+                hint = "first_trajectories(batch) or pad(logs) add it" if name == "mask" else ""
+                raise ValueError(
+                    message("logs with an entry", str(name), available=found, hint=hint)
+                )
         if trajectories.ndim != 2 or not trajectories.get("mask").any(-1).all():
             raise ValueError(
                 message(

@@ -213,7 +213,9 @@ class SummaryStatistics(TensorDictModuleBase):
         theta_key: Key of the parameters, which are handed on where present.
 
     Raises:
-        ValueError: For no functions; in a call, for discrete actions given as indices.
+        TypeError: For what is not a function.
+        ValueError: For no functions; in a call, for discrete actions given as indices, or no step.
+        KeyError: In a call, for a missing entry.
 
     Example:
         >>> from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
@@ -234,6 +236,10 @@ class SummaryStatistics(TensorDictModuleBase):
         super().__init__()
         if not functions:
             raise ValueError(message("at least one summary", "none", hint="cross_correlation"))
+        for function in functions:
+            if not callable(function):
+                expected = "functions of (state, action, next_state, mask)"
+                raise TypeError(message(expected, function, hint="summaries.linear_dynamics"))
         self.functions, self.angles = functions, tuple(angles)
         self.observation_key, self.action_key = observation_key, action_key
         self.theta_key = theta_key
@@ -287,6 +293,7 @@ class SummaryStatistics(TensorDictModuleBase):
         self, tensordict: TensorDictBase, *, ordered: bool | None = None
     ) -> dict[int, Tensor]:
         """Return the values of all functions, or of those that are ``ordered`` or not."""
+        _check_entries(tensordict, self.in_keys[:3])
         state, mask = tensordict.get(self.observation_key), tensordict.get("mask")
         action = tensordict.get(self.action_key)
         if action.ndim == mask.ndim or (action.shape[-1] == 1 and not action.is_floating_point()):
@@ -310,6 +317,16 @@ class SummaryStatistics(TensorDictModuleBase):
         names = [getattr(f, "__qualname__", type(f).__name__) for f in self.functions]
         keys = f"{self.observation_key!r}, {self.action_key!r} -> {self.out_keys[0]!r}"
         return f"SummaryStatistics({', '.join(names)}, angles={self.angles}, {keys})"
+
+
+def _check_entries(trajectories: TensorDictBase, keys: Sequence[NestedKey]) -> None:
+    missing = [key for key in keys if trajectories.get(key, None) is None]
+    if missing:
+        available = trajectories.keys(include_nested=True, leaves_only=True)
+        raise KeyError(message("trajectories with an entry", missing[0], available=available))
+    if not trajectories.batch_size.numel():
+        got = f"batch size {tuple(trajectories.batch_size)}"
+        raise ValueError(message("trajectories of at least one step", got))
 
 
 def _is_ordered(function: Summary) -> bool:

@@ -210,8 +210,11 @@ def test_bad_input_is_refused():
         env.open_loop(torch.zeros(2, 4, 1))
     with pytest.raises(RuntimeError, match="batch"):
         env.step(td[:2])
-    with pytest.raises(ValueError, match="num_envs to be a positive integer, got 0"):
-        BatchedMujocoEnv(pendulum(), 0)
+    for number in (0, 2.5):
+        with pytest.raises(ValueError, match=f"num_envs to be a positive integer, got {number}"):
+            BatchedMujocoEnv(pendulum(), number)
+    with pytest.raises(TypeError, match=r"a task or the name of one, got 'MjModel'\. Try: Task"):
+        BatchedMujocoEnv(pendulum().model, 2)
     with pytest.raises(KeyError, match=r"qvel \(did you mean this\?\)"):
         env.place({"qvl": torch.zeros(3, 1)})
     with pytest.raises(ValueError, match="3 rows of finite numbers for qvel"):

@@ -294,6 +294,8 @@ def test_parameters_outside_the_prior_are_refused(value):
 def test_too_few_pairs_are_refused():
     with pytest.raises(ValueError, match=r"at least 4 usable pairs, got 3\. Try: simulate more"):
         short_fit(posterior(), linear_gaussian(3))
+    with pytest.raises(TypeError, match=r"pairs in a TensorDict.*got 'dict'"):
+        short_fit(posterior(), {"theta": torch.zeros(9, 2), "summary": torch.zeros(9, 3)})
 
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0, 1.5])

@@ -308,6 +308,11 @@ def test_unknown_options_are_refused(options, match):
         posterior(**options)
 
 
+def test_a_prior_without_names_is_refused():
+    with pytest.raises(TypeError, match=r"a prior with named parameters, got 'dict'\. Try: Box"):
+        MixtureDensityPosterior({"mass": (0.0, 1.0)}, 5)
+
+
 def test_summaries_of_the_wrong_length_are_refused():
     with pytest.raises(ValueError, match=r"summaries of shape \(\*, 5\), got \(3, 4\)"):
         posterior().distribution(torch.zeros(3, 4))

@@ -196,7 +196,9 @@ def test_priors_show_their_names_and_numbers():
         ({}, [], "at least one named parameter, got 'an empty prior'"),
         ([("a", (0, 1)), ("a", (1, 2))], [], "every parameter once, got 'a twice'"),
         ({"a": (2, 1)}, [], r"low < high for 'a', got \(2.0, 1.0\). Try: \(1.0, 2.0\)"),
-        ({"a": (1, 1)}, [], "low < high for 'a'"),
+        ({"a": (1, 1)}, [], "low < high for 'a'.*no parameter for what is known exactly"),
+        ({"a": (0, 1e300)}, [], "finite bounds for 'a'"),
+        ({"a": (0, math.nan)}, [], "finite bounds for 'a'"),
         ({"a": (0, math.inf)}, [], "finite bounds for 'a' .* Try: .*GaussianPrior"),
         ({"a": (math.nan, 1)}, [], "finite bounds for 'a'"),
         ({"a": (0, 1)}, ["a"], "a positive lower bound for the logarithmic parameter 'a'"),
@@ -232,6 +234,15 @@ def test_a_gaussian_that_cannot_be_is_refused(moments, correlation, match):
 def test_units_of_unknown_parameters_are_refused():
     with pytest.raises(ValueError, match="units of declared parameters, got 'weight'"):
         BoxPrior({"mass": (1, 2)}, units={"weight": "kg"})
+    with pytest.raises(TypeError, match=r"units= to be {name: unit}, got 'kg'"):
+        BoxPrior({"mass": (1, 2)}, units="kg")
+
+
+def test_parameters_are_named_by_strings():
+    with pytest.raises(TypeError, match="a name that is a string, got 1"):
+        BoxPrior({1: (1, 2)})
+    with pytest.raises(TypeError, match=r"names with \(low, high\) each.*got 'NoneType'"):
+        BoxPrior(None)
 
 
 @PRIORS

@@ -234,6 +234,12 @@ def test_parameters_must_be_given_once(targets, aliases):
         MujocoPhysics(*targets, **aliases)
 
 
+@pytest.mark.parametrize(("targets", "aliases"), [((1,), {}), ((), {"a": None}), ((), {"a": [2]})])
+def test_targets_are_names(targets, aliases):
+    with pytest.raises(TypeError, match=r"the name of an entry of a model, got"):
+        MujocoPhysics(*targets, **aliases)
+
+
 def test_an_environment_without_a_model_is_refused():
     with pytest.raises(PhysicsError, match="an environment with an MjModel, got 'PendulumEnv'"):
         TransformedEnv(GymEnv("Pendulum-v1"), ApplyPhysics(MujocoPhysics("body_mass[pole]")))

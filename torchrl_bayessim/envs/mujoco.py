@@ -71,10 +71,13 @@ class BatchedMujocoEnv(EnvBase):
             "max_steps": max_steps,
             "threads": threads,
         }.items():
-            if value is not None and value < 1:
+            if value is not None and not (isinstance(value, int) and value > 0):
                 raise ValueError(message(f"{name} to be a positive integer", value))
         super().__init__(batch_size=torch.Size([num_envs]))
         self.task = known_task(task) if isinstance(task, str) else task
+        if not isinstance(self.task, Task):
+            hint = "Task(model=..., frame_skip=...) for a model of your own"
+            raise TypeError(message("a task or the name of one", type(task).__name__, hint=hint))
         self.num_envs = num_envs
         self.max_steps = max_steps or self.task.max_steps
         self._dtype = dtype

@@ -115,7 +115,10 @@ def fit(
         ValueError: For fewer than 4 usable pairs, shapes that do not match the posterior,
             parameters outside the prior, or a share that is not between 0 and 1.
         SimulationError: If no pair is finite, or the loss is not.
+        TypeError: The pairs are not a TensorDict.
     """
+    if not isinstance(data, TensorDictBase):
+        raise TypeError(message("pairs in a TensorDict of batch size (N,)", type(data).__name__))
     if not 0 < validation_fraction < 1:
         raise ValueError(message("a validation_fraction between 0 and 1", validation_fraction))
     if epochs < 1 or batch_size < 1:

@@ -90,6 +90,11 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         out_key: NestedKey = "theta",
         seed: int = 0,
     ) -> None:
+        if not isinstance(prior, Prior):
+            hint = "BoxPrior or GaussianPrior"
+            raise TypeError(
+                message("a prior with named parameters", type(prior).__name__, hint=hint)
+            )
         if isinstance(features, str) and features not in MAPS:
             raise ValueError(message("the name of a feature map", features, available=MAPS))
         network = MixtureDensityNetwork(

@@ -38,6 +38,8 @@ Pairs = Mapping[str, tuple[float, float]] | Sequence[tuple[str, tuple[float, flo
 
 def _as_list(pairs: Pairs, what: str) -> list[tuple[str, tuple[float, float]]]:
     """Return ``(name, (a, b))`` of numbers, where ``what`` says what a and b are."""
+    if not isinstance(pairs, Mapping | Sequence):
+        raise TypeError(message(f"names with {what} each, as a dictionary", type(pairs).__name__))
     found = []
     for item in pairs.items() if isinstance(pairs, Mapping) else pairs:
         try:
@@ -45,6 +47,8 @@ def _as_list(pairs: Pairs, what: str) -> list[tuple[str, tuple[float, float]]]:
             found.append((name, (float(a), float(b))))
         except (TypeError, ValueError):
             raise ValueError(message(f"a name with {what}, two numbers", item)) from None
+        if not isinstance(name, str):
+            raise TypeError(message("a name that is a string", name))
     if not found:
         raise ValueError(message("at least one named parameter", "an empty prior"))
     names = [name for name, _ in found]
@@ -74,6 +78,8 @@ class Prior(Distribution):
 
     def _name(self, names: Sequence[str], units: Mapping[str, str] | None) -> None:
         units = units or {}
+        if not isinstance(units, Mapping):
+            raise TypeError(message("units= to be {name: unit}", units))
         unknown = [name for name in units if name not in names]
         if unknown:
             raise ValueError(message("units of declared parameters", unknown[0], available=names))
@@ -234,7 +240,7 @@ def _check_bounds(
     if isinstance(log, str):
         raise TypeError(message("log= to be a list of names", log, hint=f"log=[{log!r}]"))
     for name, (low, high) in pairs:
-        if not (math.isfinite(low) and math.isfinite(high)):
+        if not all(abs(bound) <= torch.finfo(torch.float32).max for bound in (low, high)):
             raise ValueError(
                 message(
                     f"finite bounds for {name!r} (a uniform density needs a finite box)",
@@ -243,9 +249,8 @@ def _check_bounds(
                 )
             )
         if low >= high:
-            raise ValueError(
-                message(f"low < high for {name!r}", (low, high), hint=f"({high}, {low})")
-            )
+            hint = f"({high}, {low})" if low > high else "no parameter for what is known exactly"
+            raise ValueError(message(f"low < high for {name!r}", (low, high), hint=hint))
         if not np.float32(low) < np.float32(high):
             raise ValueError(
                 message(

@@ -54,6 +54,7 @@ class MujocoPhysics:
     gives NaN, and writing that NaN restores each to its own nominal value.
 
     Raises:
+        TypeError: A target is not a string.
         ValueError: There is no parameter, or two have the same name.
         PhysicsError: The model has no such entry. (Environments are checked when wrapped.)
 
@@ -69,8 +70,13 @@ class MujocoPhysics:
     """
 
     def __init__(self, *targets: str, **aliases: str | tuple[str, ...]) -> None:
-        groups = [(target, (target,)) for target in targets]
-        groups += [(n, (t,) if isinstance(t, str) else tuple(t)) for n, t in aliases.items()]
+        groups: list[tuple[str, tuple[str, ...]]] = [(target, (target,)) for target in targets]
+        for name, given in aliases.items():
+            groups.append((name, tuple(given) if isinstance(given, tuple | list) else (given,)))
+        for target in (target for _, group in groups for target in group):
+            if not isinstance(target, str):
+                hint = "body_mass[torso]"
+                raise TypeError(message("the name of an entry of a model", target, hint=hint))
         self.names = tuple(name for name, _ in groups)
         self._targets = tuple(group for _, group in groups)
         if not groups or len(set(self.names)) != len(groups) or not all(self._targets):

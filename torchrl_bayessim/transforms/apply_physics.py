@@ -30,7 +30,8 @@ class ApplyPhysics(Transform):
 
     Raises:
         PhysicsError: The simulator does not have a parameter, or does not hold what was written.
-        TypeError: It is put around a ``SerialEnv`` or ``ParallelEnv`` and not inside.
+        TypeError: It is put around a ``SerialEnv`` or ``ParallelEnv`` and not inside; or
+            ``physics`` is no `Physics`.
         ValueError: θ is not finite or has another length than ``physics.names``.
 
     Example:
@@ -43,6 +44,10 @@ class ApplyPhysics(Transform):
 
     def __init__(self, physics: Physics, *, key: NestedKey = "theta") -> None:
         super().__init__()
+        if not isinstance(physics, Physics):
+            hint = "AttributePhysics(name, ...) or MujocoPhysics(name, ...)"
+            expected = "physics with names, write and read"
+            raise TypeError(message(expected, type(physics).__name__, hint=hint))
         self.physics, self.key = physics, key
         self._written: Tensor | None = None
 

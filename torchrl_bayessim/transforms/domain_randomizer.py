@@ -98,8 +98,15 @@ class DomainRandomizer(Transform):
         """Give every environment this θ, of shape ``(D,)`` or ``(*batch, D)``, until `unpin`.
 
         Episodes meanwhile do not count: after `unpin`, draws go on where they stopped.
+
+        Raises:
+            TypeError: θ is not a tensor nor numbers.
         """
-        self._shared["pinned"] = torch.as_tensor(theta, dtype=torch.float32)
+        try:
+            self._shared["pinned"] = torch.as_tensor(theta, dtype=torch.float32)
+        except (TypeError, ValueError):
+            expected = "numbers to pin, one for each parameter"
+            raise TypeError(message(expected, theta, hint=f"the order {self.names}")) from None
 
     def unpin(self) -> None:
         """Draw again from the next resets on."""
