@@ -149,7 +149,7 @@ def make_loop(
             task.prior,
             simulations=settings.simulations,
             seed=settings.seed,
-            fit_options={"progress": settings.progress, "epochs": 40 if settings.short else 300},
+            fit_options={"progress": settings.progress},
         ),
         statistics=SummaryStatistics(*task.summaries),
         randomizer=randomizer,
