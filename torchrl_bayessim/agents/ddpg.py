@@ -168,7 +168,7 @@ class DDPG:
                 as they were before.
         """
         self._check(batch)
-        kept = batch.select(*self._kept_keys)
+        kept = batch.select(*self.kept_keys)
         before = copy.deepcopy(self._learned())
         try:
             with isolated(self.seed, "ddpg update", *key):
@@ -180,7 +180,7 @@ class DDPG:
             raise
 
     def _check(self, batch: TensorDictBase) -> None:
-        for key in self._kept_keys:
+        for key in self.kept_keys:
             value = batch.get(key, None)
             if value is None:
                 available = sorted(map(str, batch.keys(include_nested=True)))
@@ -193,7 +193,8 @@ class DDPG:
                 )
 
     @property
-    def _kept_keys(self) -> list[Any]:
+    def kept_keys(self) -> list[Any]:
+        """The entries of a batch that go into the replay buffer."""
         states = [*GOAL_KEYS, *self.state.critic_keys]
         following = [("next", key) for key in (*states, "reward", "done", "terminated")]
         return [*states, "action", *following]
