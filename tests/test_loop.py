@@ -138,6 +138,28 @@ class Recorder(PPO):
 # One policy per summary, and the same batches for posterior and learner.
 
 
+def test_real_data_and_true_parameters_are_in_no_training_set(monkeypatch):
+    pairs, observed = [], []
+    learn = PosteriorRefinement.learn
+
+    def watched(self, theta, summary, real, *, key):
+        pairs.append((theta, summary))
+        observed.append(torch.atleast_2d(real))
+        return learn(self, theta, summary, real, key=key)
+
+    monkeypatch.setattr(PosteriorRefinement, "learn", watched)
+    loop = make_loop(rounds=2)
+    rounds = list(loop)
+    assert len(pairs) == 2
+    for turn, (theta, summary), real in zip(rounds, pairs, observed, strict=True):
+        each = loop.statistics(turn.real)["summary"]
+        size = each.shape[-1]  # a later round's summaries are one for each policy so far
+        blocks = summary.reshape(-1, size)
+        for row in torch.cat([real.reshape(-1, size), each]):
+            assert not (blocks == row).all(-1).any()
+        assert not (theta == TRUTH).any()
+
+
 def test_every_real_summary_is_kept_with_the_policy_that_made_it():
     env, randomizer = make_env()
     learner, robot = Recorder(env), make_robot()

@@ -9,6 +9,7 @@ from torchrl.envs import Compose, GymEnv, SerialEnv, StepCounter, Transform, Tra
 
 from torchrl_bayessim.agents.ppo import PPO
 from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
+from torchrl_bayessim.envs.classic_control.pendulum import PendulumEnv
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.errors import PhysicsError, SimulationError
 from torchrl_bayessim.inference.priors import BoxPrior
@@ -247,3 +248,22 @@ def test_counts_are_positive(name):
     )
     with pytest.raises(ValueError, match=f"{name} to be positive"):
         simulate(env, None, SummaryStatistics(linear_dynamics), randomizer, **counts)
+
+
+@pytest.mark.parametrize("make", [lambda: PendulumEnv(8), lambda: GymEnv("Pendulum-v1")])
+def test_without_a_policy_actions_cover_their_range_evenly(make):
+    def torques(state, action, next_state, mask):
+        return action[..., 0]
+
+    prior = BoxPrior({"m": (0.5, 2.0)})
+    randomizer = DomainRandomizer(prior)
+    env = TransformedEnv(make(), Compose(ApplyPhysics(AttributePhysics("m")), randomizer))
+    pairs = simulate(
+        env, None, SummaryStatistics(torques), randomizer, pairs=40, max_steps=50, progress=False
+    )
+    torque = pairs["summary"].flatten()
+    levels = torch.linspace(0, 1, 9)
+    quantiles = torch.quantile(torque, levels)
+    torch.testing.assert_close(quantiles, 4 * levels - 2, rtol=0, atol=0.2)  # ± 2 N m
+    assert quantiles[0] < -1.95
+    assert quantiles[-1] > 1.95
