@@ -102,6 +102,7 @@ def learning_curves(
     xlabel: str = "frames",
     ylabel: str = "return",
     baseline: Mapping[str, float] | None = None,
+    marks: Mapping[str, float] | None = None,
 ) -> Figure:
     """Draw a line per entry of ``curves``, with a band where there are several seeds.
 
@@ -111,6 +112,7 @@ def learning_curves(
         xlabel: What the horizontal axis counts.
         ylabel: What the vertical axis shows.
         baseline: Names and heights of horizontal lines.
+        marks: Names and places of vertical lines.
 
     Raises:
         ValueError: No curve, or shapes that do not agree.
@@ -140,10 +142,13 @@ def learning_curves(
             axes.fill_between(steps, low, high, color=colour, alpha=0.18, lw=0)
     for name, height in (baseline or {}).items():
         axes.axhline(height, color=_GREY, lw=1.2, ls="--", label=name)
+    for name, place in (marks or {}).items():
+        axes.axvline(place, color=_INK, lw=1.0, ls=":", label=name)
     axes.set_xlabel(xlabel)
     axes.set_ylabel(ylabel)
     axes.grid(axis="y", color=_LIGHT, lw=0.6)
-    _thousands(axes)
+    if axes.get_xlim()[1] >= 1000:
+        _thousands(axes)
     axes.legend(frameon=False, fontsize=9)
     return figure
 

@@ -1,0 +1,128 @@
+"""Tables and pictures of `robustness.py`: curves over physics, and paired differences."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from pathlib import Path
+from typing import Any
+
+import torch
+from sim2real_seeds import interval
+
+from torchrl_bayessim import plots
+
+
+def curves(runs: list[dict[str, Any]], parameters: list[str]) -> list[dict[str, Any]]:
+    """Return the entries ``curves`` of result.json: means and spread over the seeds."""
+    found = []
+    for source in dict.fromkeys(run["source"] for run in runs):
+        own = [run for run in runs if run["source"] == source]
+        for name in parameters:
+            scores = torch.tensor([run["grids"][name]["score"] for run in own])
+            spread = scores.std(0) if len(own) > 1 else torch.zeros(scores.shape[1])
+            found.append(
+                {
+                    "source": source,
+                    "parameter": name,
+                    "grid": own[0]["grids"][name]["grid"],
+                    "return_mean": scores.mean(0).tolist(),
+                    "return_sd": spread.tolist(),
+                    "seeds": len(own),
+                    "by_seed": scores.tolist(),
+                }
+            )
+    return found
+
+
+def at_real(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return each source's scores at the robot, and the posterior's differences by seed."""
+    scores = {
+        source: [run["at_real"] for run in runs if run["source"] == source]
+        for source in dict.fromkeys(run["source"] for run in runs)
+    }
+    found: dict[str, Any] = {source: _spread(values) for source, values in scores.items()}
+    for other in ("prior", "oracle"):
+        if {"posterior", other} <= scores.keys():
+            pairs = zip(scores["posterior"], scores[other], strict=True)
+            found[f"posterior minus {other}"] = _spread([a - b for a, b in pairs])
+    return found
+
+
+def frames_to_solve(runs: list[dict[str, Any]]) -> dict[str, list[float | None]] | None:
+    """Return the frames at which each policy first solved its own training physics, by source."""
+    if not all("frames_to_solve" in run for run in runs):
+        return None
+    return {
+        source: [run["frames_to_solve"] for run in runs if run["source"] == source]
+        for source in dict.fromkeys(run["source"] for run in runs)
+    }
+
+
+def _spread(values: list[float]) -> dict[str, Any]:
+    if len(values) > 1:
+        found: dict[str, Any] = interval(values)
+        return found | {"sd": statistics.stdev(values)}
+    return {"mean": values[0], "low": None, "high": None, "values": values, "sd": None}
+
+
+def table(result: dict[str, Any]) -> str:
+    """Return the scores at the robot in Markdown."""
+    seeds, score = result["seeds"], result["score"]
+    lines = [
+        f"{result['task']}, {result['algorithm']}, {seeds} seeds, {result['frames']:,} frames per "
+        f"policy, {score} in {result['real_episodes']} episodes at the robot "
+        f"({', '.join(f'{n} {v:.3g}' for n, v in _truth(result))})",
+        "",
+        f"| trained under | {score} at the robot, mean and 95 % interval over seeds | spread (sd) "
+        "| each seed |" + (" first solved after (frames) |" if result["frames_to_solve"] else ""),
+        "|---|---|---|---|" + ("---|" if result["frames_to_solve"] else ""),
+    ]
+    for source, entry in result["at_real"].items():
+        span = "" if entry["low"] is None else f" [{entry['low']:.3g}, {entry['high']:.3g}]"
+        spread = "" if entry["sd"] is None else f"{entry['sd']:.2g}"
+        each = ", ".join(f"{value:.3g}" for value in entry["values"])
+        line = f"| {source} | {entry['mean']:.3g}{span} | {spread} | {each} |"
+        if result["frames_to_solve"]:
+            solved = result["frames_to_solve"].get(source, [])
+            line += " " + ", ".join("never" if f is None else f"{f:,.0f}" for f in solved) + " |"
+        lines.append(line)
+    told = [run["posterior"] for run in result["posteriors"]]
+    if told:
+        lines += ["", "| seed | posterior, mean ± sd | nats over the prior |", "|---|---|---|"]
+    for run in result["posteriors"]:
+        moments = zip(
+            result["parameters"], run["posterior"]["mean"], run["posterior"]["sd"], strict=True
+        )
+        cell = ", ".join(f"{name} {mean:.3g} ± {sd:.2g}" for name, mean, sd in moments)
+        lines.append(f"| {run['seed']} | {cell} | {run['posterior']['nats_over_prior']:+.1f} |")
+    return "\n".join(lines) + "\n"
+
+
+def _truth(result: dict[str, Any]) -> Any:
+    return zip(result["parameters"], result["true"], strict=True)
+
+
+def draw_pictures(out: Path, result: dict[str, Any]) -> list[Path]:
+    """Write robustness_PARAMETER.png and learning.png; return their paths."""
+    paths = []
+    for name, truth in _truth(result):
+        own = [curve for curve in result["curves"] if curve["parameter"] == name]
+        lines = {c["source"]: (torch.tensor(c["grid"]), torch.tensor(c["by_seed"])) for c in own}
+        figure = plots.learning_curves(
+            lines, xlabel=name, ylabel=result["score"], marks={"the robot": truth}
+        )
+        paths.append(out / f"robustness_{name}.png")
+        figure.savefig(paths[-1], dpi=150)
+    lines = {}
+    for source in dict.fromkeys(run["source"] for run in result["runs"]):
+        own = [run["curve"] for run in result["runs"] if run["source"] == source]
+        key = "score" if all("score" in point for point in own[0]) else "return"
+        values = [[p[key] if p[key] is not None else math.nan for p in curve] for curve in own]
+        frames = [point["frames"] for point in own[0]]
+        lines[source] = torch.tensor(frames), torch.tensor(values).nan_to_num(0.0)
+    if lines and all(len(x) for x, _ in lines.values()):
+        figure = plots.learning_curves(lines, ylabel=f"{result['score']} under its own physics")
+        paths.append(out / "learning.png")
+        figure.savefig(paths[-1], dpi=150)
+    return paths

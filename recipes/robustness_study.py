@@ -1,0 +1,180 @@
+"""The policies of one seed: trained under each source of physics, kept, and scored alike."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import recipe
+import torch
+from fetch_tasks import MEASURED, GoalTask
+from tasks import Task
+from torch import Tensor
+from training import Plan, train
+
+from torchrl_bayessim import checkpoint
+from torchrl_bayessim.agents.ppo import PPO
+from torchrl_bayessim.evaluation import evaluate, successes
+from torchrl_bayessim.inference.refinement import PosteriorRefinement
+from torchrl_bayessim.influence import check_influence
+from torchrl_bayessim.randomness import isolated
+from torchrl_bayessim.robots import SurrogateRobot, comparable
+from torchrl_bayessim.simulate import simulate
+from torchrl_bayessim.sources import Grid
+from torchrl_bayessim.summaries import SummaryStatistics
+from torchrl_bayessim.transforms import DomainRandomizer
+
+SOLVED = {"cartpole": 475.0}  # return of the finished episodes in a batch, as Gymnasium has it
+
+
+def nominal(task: Task) -> Tensor:
+    """Return the simulator's own parameters."""
+    env = task.make(1, seed=0, randomizer=None)
+    return env.reset()["theta"][0]
+
+
+class Study:
+    """The policies of one seed, each trained once and kept."""
+
+    def __init__(self, task: Task, truth: Tensor, settings: Any, out: Path, *, seed: int) -> None:
+        self.task, self.truth, self.settings, self.seed = task, truth, settings, seed
+        self.out = out
+        self.randomizer = DomainRandomizer(task.prior, seed=seed)
+        self.env = task.make(task.environments, seed=seed, randomizer=self.randomizer)
+        check_influence(self.env, self.randomizer, task.prior, steps=task.horizon)
+        self.algorithm = getattr(self._learner(), "name", "PPO")
+
+    def scored(self, source: str) -> dict[str, Any]:
+        """Return the scores of the policy trained under ``source``, from its file if it has one."""
+        file = self.out / f"{source}.json"
+        if file.exists():
+            return json.loads(file.read_text())
+        learner = self._learner()
+        trained = self._trained(source, learner)
+        learner.policy.load_state_dict(trained.best)
+        checkpoint.save(self.out / f"{source}_policy.pt", trained.best)
+        found = self._scores(learner.policy) | {"posterior": self._posterior_moments(source)}
+        solved = SOLVED.get(self.settings.task)
+        if solved is not None:
+            found["frames_to_solve"] = next(
+                (p["frames"] for p in trained.curve if p["return"] >= solved), None
+            )
+        names = ("frames", "return", "score", "seconds", "cpu_seconds")
+        found["curve"] = [
+            {name: point[name] for name in names if name in point}
+            for index, point in enumerate(trained.curve)
+            if "score" in point or (index + 1) % max(1, len(trained.curve) // 40) == 0
+        ]
+        recipe.write(file, json.dumps(recipe.plain(found)))
+        return recipe.plain(found)
+
+    def _learner(self) -> Any:
+        if isinstance(self.task, GoalTask):
+            return self.task.learner(self.env, seed=self.seed)
+        return PPO(self.env, seed=self.seed, **self.task.ppo)
+
+    def _trained(self, source: str, learner: Any) -> Any:
+        self.randomizer.source = self._source(source)
+        goals = isinstance(self.task, GoalTask)
+        batches = self.settings.batches or (self.task.budget if goals else 150)
+        plan = Plan(
+            2 if self.settings.short else batches,
+            self.task.horizon,
+            file=self.out / f"{source}.pt",
+            keep_every=50,
+        )
+        return train(
+            learner,
+            self.env,
+            self.randomizer,
+            plan,
+            key=(self.seed, "robustness"),  # the same for all sources: common random numbers
+            score=self._select(source) if goals and not self.settings.short else None,
+            label=f"seed {self.seed}, {source}",
+            progress=self.settings.progress,
+        )
+
+    def _source(self, source: str) -> Any:
+        if source == "prior":
+            return self.task.prior
+        if source == "posterior":
+            return self._posterior()
+        return Grid((self.truth if source == "oracle" else nominal(self.task))[None])
+
+    def _posterior(self) -> Any:
+        """Infer the posterior from what the prior's policy does at the robot."""
+        refinement = self._refinement()
+        file = self.out / "posterior_state.pt"
+        if file.exists():
+            refinement.load_state_dict(checkpoint.load(file))
+            return refinement.posterior
+        task, settings = self.task, self.settings
+        learner = self._learner()
+        learner.policy.load_state_dict(checkpoint.load(self.out / "prior_policy.pt"))
+        statistics = SummaryStatistics(*task.summaries)
+        measured = MEASURED if isinstance(task, GoalTask) else ("observation",)
+        env = task.make(settings.episodes, seed=self.seed, randomizer=None)
+        robot = SurrogateRobot(env, self.truth, max_steps=task.horizon, measured=measured)
+        real = robot.rollouts(learner.policy, episodes=settings.episodes, key=(self.seed, "real"))
+        observed = statistics.together(comparable(real, horizon=task.horizon))
+        self.randomizer.source = task.prior
+        pairs = simulate(
+            self.env,
+            learner.policy,
+            statistics,
+            self.randomizer,
+            pairs=settings.simulations,
+            max_steps=task.horizon,
+            trajectories=settings.episodes,
+            seed=self.seed,
+            progress=settings.progress,
+        )
+        refinement.learn(pairs["theta"], pairs["summary"], observed, key=("robustness",))
+        checkpoint.save(file, refinement.state_dict())
+        return refinement.posterior
+
+    def _refinement(self) -> PosteriorRefinement:
+        epochs = 40 if self.settings.short else 300
+        options = {"progress": self.settings.progress, "epochs": epochs}
+        return PosteriorRefinement(self.task.prior, seed=self.seed, fit_options=options)
+
+    def _posterior_moments(self, source: str) -> dict[str, Any] | None:
+        if source != "posterior":
+            return None
+        posterior = self._posterior()
+        gain = posterior.log_prob(self.truth) - self.task.prior.log_prob(self.truth)
+        return {
+            "mean": posterior.mean.tolist(),
+            "sd": posterior.stddev.tolist(),
+            "nats_over_prior": gain.item(),
+        }
+
+    def _select(self, source: str) -> Any:
+        """Return the score by which a checkpoint is chosen: other episodes, own physics."""
+        physics = self._source(source)
+        return lambda policy: self._score(policy, physics, count=64, seed=7).mean().item()
+
+    def _scores(self, policy: Any) -> dict[str, Any]:
+        settings, truth = self.settings, self.truth
+        episodes = settings.grid_episodes
+        grids = {}
+        for column, name in enumerate(self.task.prior.names):
+            low, high = self.task.prior.low[column], self.task.prior.high[column]
+            values = torch.linspace(low.item(), high.item(), settings.points)
+            theta = truth.repeat(settings.points, 1)
+            theta[:, column] = values
+            found = self._score(policy, Grid(theta), count=settings.points * episodes, seed=11)
+            means = found.reshape(episodes, settings.points).mean(0)
+            grids[name] = {"grid": values.tolist(), "score": means.tolist()}
+        count = settings.real_episodes
+        at_real = self._score(policy, Grid(truth[None]), count=count, seed=13)
+        return {"grids": grids, "at_real": at_real.mean().item(), "real_episodes": len(at_real)}
+
+    def _score(self, policy: Any, source: Any, *, count: int, seed: int) -> Tensor:
+        """Return return or success of ``count`` episodes, the same ones for the same seed."""
+        randomizer = DomainRandomizer(source, seed=seed)
+        env = self.task.make(count, seed=seed, randomizer=randomizer)
+        rule = successes if isinstance(self.task, GoalTask) else evaluate
+        with isolated("robustness", seed):
+            return rule(env, policy, max_steps=self.task.max_steps).float()

@@ -1,0 +1,100 @@
+"""The figure of robustness as users make it, in its shortest setting."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+RECIPES = Path(__file__).parent.parent / "recipes"
+TINY = ["short=true", "progress=false", "seeds=2", "points=3"]
+
+
+@pytest.fixture(scope="module")
+def run():
+    sys.path.insert(0, str(RECIPES))
+    import recipe
+    import robustness
+
+    def run(*arguments):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "argv", ["robustness.py", *arguments])
+            recipe.main(robustness.Robustness, robustness.job)
+
+    yield run
+    sys.path.remove(str(RECIPES))
+
+
+@pytest.fixture(scope="module")
+def finished(run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("robustness")
+    run(*TINY, "task=fetch_reach", "sources=prior,posterior,oracle", f"out={folder}")
+    return folder
+
+
+def test_curves_and_paired_differences_are_there(finished):
+    from matplotlib.image import imread
+
+    result = json.loads((finished / "result.json").read_text())
+    assert {"task", "curves", "at_real"} <= result.keys()
+    assert [curve["source"] for curve in result["curves"]] == ["prior", "posterior", "oracle"]
+    for curve in result["curves"]:
+        assert curve["grid"] == pytest.approx([10, 105, 200])
+        assert len(curve["return_mean"]) == len(curve["return_sd"]) == 3
+        assert all(0 <= mean <= 1 for mean in curve["return_mean"])
+        assert curve["seeds"] == 2
+    real = result["at_real"]
+    pairs = zip(real["posterior"]["values"], real["prior"]["values"], strict=True)
+    assert real["posterior minus prior"]["values"] == pytest.approx([a - b for a, b in pairs])
+    assert {"provenance", "posteriors"} <= result.keys()
+    assert "| posterior minus prior |" in (finished / "table.md").read_text()
+    assert imread(finished / "robustness_damping.png")[..., :3].std() > 0.01
+
+
+def test_finished_policies_are_not_trained_again(finished, run, capsys):
+    before = json.loads((finished / "result.json").read_text())
+    run(f"resume={finished}", "progress=false")
+    assert "RESULT" in capsys.readouterr().out
+    after = json.loads((finished / "result.json").read_text())
+    assert after["runs"] == before["runs"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["task=cartpol"], "got 'cartpol'. Available: cartpole (did you mean this?)"),
+        (["sources=prior,posteriori"], "got 'posteriori'. Available: posterior (did you mean"),
+        (["sources=posterior"], "expected the prior among the sources"),
+        (["algorithm=td3"], "expected an algorithm for Fetch tasks only, got 'td3'"),
+        (["setting=weak"], "expected a setting, got 'weak'. Available: paper, strong"),
+    ],
+)
+def test_bad_settings_are_explained(arguments, said, run, tmp_path, capsys):  # noqa: PLR0917
+    with pytest.raises(SystemExit, match="2"):
+        run("short=true", *arguments, f"out={tmp_path}")
+    (line,) = [x for x in capsys.readouterr().err.splitlines() if x.startswith("robustness")]
+    assert said in line
+
+
+def test_intervals_are_students(run):
+    import robustness_report
+
+    runs = [
+        {"source": source, "at_real": score}
+        for source, scores in {"prior": (1, 2, 3), "posterior": (3, 3, 6)}.items()
+        for score in scores
+    ]
+    found = robustness_report.at_real(runs)["posterior minus prior"]
+    assert found["values"] == [2, 1, 3]
+    # mean 2, standard deviation 1, and the 97.5 % quantile of t with 2 degrees of freedom, 4.3027
+    assert found["high"] - found["mean"] == pytest.approx(4.3027 / 3**0.5, rel=1e-4)
+
+
+def test_nominal_physics_that_are_true_are_trained_once(run, capsys):
+    import robustness
+    import torch
+
+    settings = robustness.Robustness()
+    same, other = torch.tensor([0.5, 0.1]), torch.tensor([0.6, 0.1])
+    assert robustness.chosen_sources(settings, same, same) == ["prior", "posterior", "oracle"]
+    assert robustness.chosen_sources(settings, same, other)[0] == "nominal"
