@@ -131,6 +131,20 @@ def test_the_analytic_correction_trains_on_the_last_round_alone():
     assert last.effective_pairs == pytest.approx(300)
 
 
+def test_a_prior_that_excludes_the_data_is_said():
+    far = torch.full((1, 1), 50.0)  # x = θ² is 4 at most
+    rounds = sequential(square(0), BOX, far, rounds=1, simulations=400, **QUICK)
+    with pytest.warns(UserWarning, match="Does the prior hold the real"):
+        list(rounds)
+
+
+@pytest.mark.parametrize("wrong", [lambda theta: theta[:3], lambda theta: theta[:, 0], list])
+def test_a_simulator_gives_one_summary_per_simulation(wrong):
+    rounds = sequential(wrong, BOX, OBSERVED, rounds=1, simulations=9, **QUICK)
+    with pytest.raises(ValueError, match=r"one summary per simulation, shape \(9, L\), got"):
+        next(rounds)
+
+
 def test_an_unknown_correction_is_refused():
     rounds = sequential(square(0), BOX, OBSERVED, rounds=1, simulations=9, correction="snpe")
     with pytest.raises(ValueError, match=r"expected a correction.*snpe.*importance.*truncated"):

@@ -7,15 +7,16 @@ Pritzel & Blundell, 2017, arXiv:1612.01474).
 
 from __future__ import annotations
 
-__all__ = ["PosteriorMaker", "average", "learn"]
+__all__ = ["PosteriorMaker", "average", "learn", "pairs_of"]
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from ..errors import message
 from .fit import FitReport, fit
 from .physics_posterior import PhysicsPosterior
 from .posterior import MixtureDensityPosterior
@@ -50,6 +51,22 @@ def learn(
         reports.append(fit(network, pairs, **{"seed": seed, **fit_options}))
         members.append(network.condition(observed, check=False).mixture)
     return PhysicsPosterior(average(members), prior), reports[0]
+
+
+def pairs_of(theta: Tensor, summary: Tensor) -> TensorDict:
+    """Return ``{"theta", "summary"}`` of parameters ``(N, D)`` and what was simulated at them.
+
+    Raises:
+        ValueError: There is not one summary for each.
+
+    Example:
+        >>> pairs_of(torch.zeros(3, 2), torch.zeros(3, 5)).batch_size
+        torch.Size([3])
+    """
+    got = tuple(summary.shape) if isinstance(summary, Tensor) else type(summary).__name__
+    if not isinstance(got, tuple) or len(got) != 2 or got[0] != len(theta):
+        raise ValueError(message(f"one summary per simulation, shape ({len(theta)}, L)", got))
+    return TensorDict({"theta": theta, "summary": summary}, batch_size=[len(theta)])
 
 
 def average(members: Sequence[TruncatedGaussianMixture]) -> TruncatedGaussianMixture:

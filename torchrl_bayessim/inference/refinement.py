@@ -16,13 +16,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
 from ..errors import message
 from ..randomness import seed_from
 from ..sources import Defensive, draw
-from .ensemble import PosteriorMaker, learn
+from .ensemble import PosteriorMaker, learn, pairs_of
 from .fit import FitReport
 from .misspecification import doubts
 from .physics_posterior import PhysicsPosterior
@@ -134,7 +133,7 @@ class PosteriorRefinement:
         """
         _check_finite(observed)
         local, proposal = self._proposal()
-        pairs = TensorDict({"theta": theta, "summary": summary}, batch_size=[len(theta)])
+        pairs = pairs_of(theta, summary)
         if proposal is not local:
             counted = [(proposal, len(theta))]
             pairs["weight"] = importance_weights(theta, self.prior, counted)

@@ -8,19 +8,21 @@ from __future__ import annotations
 
 __all__ = ["Correction", "SequentialRound", "sequential"]
 
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ..errors import message
 from ..randomness import seed_from
 from ..sources import Defensive, draw
-from .ensemble import learn
+from .ensemble import learn, pairs_of
 from .fit import FitReport
+from .misspecification import doubts
 from .physics_posterior import PhysicsPosterior
 from .posterior import MixtureDensityPosterior
 from .priors import Prior
@@ -90,7 +92,11 @@ def sequential(
         One :class:`SequentialRound` after another.
 
     Raises:
-        ValueError: On the first turn, for an unknown correction or counts that are too small.
+        ValueError: On the first turn, for an unknown correction or counts that are too small, or a
+            simulator that does not give one summary per simulation.
+
+    Warns if the real summaries lie apart from all simulated ones, or the posterior at an edge: see
+    :mod:`.misspecification`.
     """
     if rounds < 1 or simulations < 4 or networks < 1:
         expected = "at least 1 round, 4 simulations and 1 network"
@@ -100,10 +106,10 @@ def sequential(
             message("a correction", correction, available=["importance", "truncated", "analytic"])
         )
     proposal: Any = prior
-    history: list[tuple[Proposal, Tensor, Tensor]] = []
+    history: list[tuple[Proposal, TensorDict]] = []
     for index in range(rounds):
         theta = draw(proposal, simulations, key=(seed, "theta", index))
-        history.append((proposal, theta, simulator(theta)))
+        history.append((proposal, pairs_of(theta, simulator(theta))))
         if correction == "analytic":
             history = history[-1:]
         pairs = _pairs(history, prior, weighted=correction != "analytic")
@@ -122,21 +128,22 @@ def sequential(
         repaired = 0
         if correction == "analytic" and index > 0:
             posterior, repaired = analytic_correction(posterior, proposal)
+        for doubt in doubts(pairs["summary"], observed, posterior):
+            warnings.warn(doubt, stacklevel=2)
         effective = effective_sample_size(pairs["weight"])
         yield SequentialRound(index, posterior, report, effective, repaired)
         proposal = _next_proposal(posterior, prior, correction, prior_share)
 
 
 def _pairs(
-    history: list[tuple[Proposal, Tensor, Tensor]], prior: Prior, *, weighted: bool
-) -> TensorDict:
-    theta = torch.cat([theta for _, theta, _ in history])
-    weight = torch.ones(len(theta))
+    history: list[tuple[Proposal, TensorDict]], prior: Prior, *, weighted: bool
+) -> TensorDictBase:
+    pairs: Any = torch.cat([pairs for _, pairs in history])  # typed as if of tensors
+    weight = torch.ones(len(pairs))
     if weighted:
-        proposals = [(proposal, len(theta)) for proposal, theta, _ in history]
-        weight = importance_weights(theta, prior, proposals)
-    summary = torch.cat([summary for _, _, summary in history])
-    return TensorDict({"theta": theta, "summary": summary, "weight": weight}, [len(theta)])
+        proposals = [(proposal, len(pairs)) for proposal, pairs in history]
+        weight = importance_weights(pairs["theta"], prior, proposals)
+    return pairs.set("weight", weight)
 
 
 def _next_proposal(
