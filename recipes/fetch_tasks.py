@@ -106,7 +106,7 @@ FETCH: dict[str, GoalTask] = {
         summaries=(sliding, pushes),
         warmup=250,
         updates=125,
-        budget=500,
+        budget=600,
     ),
     "fetch_slide": goal_task(
         "FetchSlide-v4",

@@ -23,7 +23,7 @@ from typing import Any
 import recipe
 import torch
 from fetch_tasks import FETCH, GoalTask
-from robustness_report import at_real, curves, draw_pictures, frames_to_solve, table
+from robustness_report import at_real, curves, draw_pictures, table
 from robustness_study import Study, nominal
 from tasks import TASKS, Task
 from torch import Tensor
@@ -88,7 +88,6 @@ def job(settings: Robustness, out: Path) -> dict[str, Any]:
         "real_episodes": runs[0]["real_episodes"],
         "curves": curves(runs, list(task.prior.names)),
         "at_real": at_real(runs),
-        "frames_to_solve": frames_to_solve(runs),
         "posteriors": [
             {"seed": run["seed"], "posterior": run["posterior"]} for run in runs if run["posterior"]
         ],

@@ -49,16 +49,6 @@ def at_real(runs: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def frames_to_solve(runs: list[dict[str, Any]]) -> dict[str, list[float | None]] | None:
-    """Return the frames at which each policy first solved its own training physics, by source."""
-    if not all("frames_to_solve" in run for run in runs):
-        return None
-    return {
-        source: [run["frames_to_solve"] for run in runs if run["source"] == source]
-        for source in dict.fromkeys(run["source"] for run in runs)
-    }
-
-
 def _spread(values: list[float]) -> dict[str, Any]:
     if len(values) > 1:
         found: dict[str, Any] = interval(values)
@@ -75,18 +65,16 @@ def table(result: dict[str, Any]) -> str:
         f"({', '.join(f'{n} {v:.3g}' for n, v in _truth(result))})",
         "",
         f"| trained under | {score} at the robot, mean and 95 % interval over seeds | spread (sd) "
-        "| each seed |" + (" first solved after (frames) |" if result["frames_to_solve"] else ""),
-        "|---|---|---|---|" + ("---|" if result["frames_to_solve"] else ""),
+        "| each seed | its own physics first solved after (frames) |",
+        "|---|---|---|---|---|",
     ]
     for source, entry in result["at_real"].items():
         span = "" if entry["low"] is None else f" [{entry['low']:.3g}, {entry['high']:.3g}]"
         spread = "" if entry["sd"] is None else f"{entry['sd']:.2g}"
         each = ", ".join(f"{value:.3g}" for value in entry["values"])
-        line = f"| {source} | {entry['mean']:.3g}{span} | {spread} | {each} |"
-        if result["frames_to_solve"]:
-            solved = result["frames_to_solve"].get(source, [])
-            line += " " + ", ".join("never" if f is None else f"{f:,.0f}" for f in solved) + " |"
-        lines.append(line)
+        solved = [run["solved"] for run in result["runs"] if run["source"] == source]
+        when = ", ".join("never" if at is None else f"{at['frames']:,.0f}" for at in solved)
+        lines.append(f"| {source} | {entry['mean']:.3g}{span} | {spread} | {each} | {when} |")
     told = [run["posterior"] for run in result["posteriors"]]
     if told:
         lines += ["", "| seed | posterior, mean ± sd | nats over the prior |", "|---|---|---|"]

@@ -153,11 +153,11 @@ def scored(curve: list[dict[str, float]]) -> list[dict[str, float]]:
     return [point for point in curve if "score" in point]
 
 
-def reached_at(curve: list[dict[str, float]], score: float) -> dict[str, float] | None:
-    """Return frames and seconds of the first point with at least this score."""
-    for point in scored(curve):
-        if point["score"] >= score:
-            return {name: point[name] for name in ("frames", "seconds", "cpu_seconds", "score")}
+def first_solved(curve: list[dict[str, float]], least: float) -> dict[str, float] | None:
+    """Return where a curve first scores (or, without scores, returns) at least ``least``."""
+    for point in scored(curve) or curve:
+        if point.get("score", point["return"]) >= least:
+            return {name: point[name] for name in ("frames", "seconds", "cpu_seconds")}
     return None
 
 
