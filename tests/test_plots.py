@@ -47,6 +47,19 @@ def test_marginals_integrate_to_one():
         assert np.trapezoid(line.get_ydata(), line.get_xdata()) == pytest.approx(1, abs=0.03)
 
 
+@pytest.mark.parametrize("far", [3.0, 300.0])
+def test_a_sample_far_out_leaves_the_shape_of_the_rest(far):
+    normal = torch.distributions.Normal(0.0, 1.0).icdf(torch.linspace(0.0005, 0.9995, 4000))
+    samples = torch.stack([normal, normal.reshape(2, -1).T.flatten()], -1)
+    samples[0] = far
+    figure = pair_plot(samples, names=["a", "b"], zoom=True)
+    (line,) = figure.axes[0].get_lines()
+    assert (line.get_ydata() > 0.5 * line.get_ydata().max()).sum() > 10
+    assert line.get_xdata()[line.get_ydata().argmax()] == pytest.approx(0, abs=0.5)
+    steps = np.unique(np.round(figure.axes[1].collections[-1].get_paths()[0].vertices[:, 0], 3))
+    assert len(steps) > 20  # the contour, too
+
+
 def test_contours_hold_half_and_nine_tenths_of_the_samples():
     samples = torch.randn(20_000, 2) @ torch.tensor([[1.0, 0.8], [0.0, 0.3]])
     figure = pair_plot(samples, names=["a", "b"])

@@ -67,6 +67,8 @@ def pair_plot(
         raise ValueError(message("one unit per name", f"{len(units)} for {len(names)} names"))
     labels = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)]
     limits = _limits(points if prior is None or zoom else prior, true)
+    low, high = np.array(limits).T
+    shown = points[((points >= low) & (points <= high)).all(1)]
     d = len(names)
     figure = _figure(width=max(3.4, 2.1 * d + 0.6), height=max(3.0, 2.0 * d + 0.5))
     grid = figure.add_gridspec(d, d, hspace=0.08, wspace=0.08)
@@ -81,7 +83,7 @@ def pair_plot(
                 if prior is not None:
                     # Dots: contours of a flat density would show nothing but its noise.
                     axes.plot(*prior[:1_000, pair].T, ".", color="#C4C4C4", ms=1.5, zorder=0)
-                _pair(axes, points[:, pair])
+                _pair(axes, shown[:, pair])
                 axes.set_xlim(*limits[column])
                 axes.set_ylim(*limits[row])
             if true is not None:
@@ -261,11 +263,12 @@ def _limits(points: np.ndarray, true: np.ndarray | None) -> list[tuple[float, fl
 
 
 def _marginal(axes: Axes, values: np.ndarray, prior: np.ndarray | None) -> None:
+    limits = axes.get_xlim()
     if prior is not None:
-        centres, heights = _density(prior)
+        centres, heights = _density(prior, limits)
         axes.fill_between(centres, heights, color=_LIGHT, lw=0)
         axes.plot(centres, heights, color=_GREY, lw=1.0)
-    centres, heights = _density(values)
+    centres, heights = _density(values, limits)
     axes.fill_between(centres, heights, color=_BLUE, alpha=0.25, lw=0)
     axes.plot(centres, heights, color=_BLUE, lw=1.6)
     axes.set_ylim(bottom=0)
@@ -273,10 +276,14 @@ def _marginal(axes: Axes, values: np.ndarray, prior: np.ndarray | None) -> None:
     axes.spines["left"].set_visible(False)
 
 
-def _density(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where the density of ``values`` was estimated, and the estimate, over their range."""
-    edges = _edges(values)
-    heights = gaussian_filter(np.histogram(values, edges, density=True)[0], 2.0)
+def _density(values: np.ndarray, limits: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the density of ``values`` was estimated, and the estimate, within ``limits``."""
+    shown = values[(values >= limits[0]) & (values <= limits[1])]
+    if not len(shown):
+        return np.zeros(0), np.zeros(0)
+    edges = _edges(shown)  # not of all: one sample far out would leave the rest a single bin
+    share = len(shown) / len(values)
+    heights = share * gaussian_filter(np.histogram(shown, edges, density=True)[0], 2.0)
     centres = (edges[1:] + edges[:-1]) / 2
     return np.pad(centres, 1, mode="edge"), np.pad(heights, 1)
 
