@@ -58,25 +58,32 @@ def goal_task(simulator_name: str, **settings: Any) -> GoalTask:
     )
 
 
-def sliding(state: Tensor, action: Tensor, next_state: Tensor, mask: Tensor) -> Tensor:
-    """Return how objects that move come to rest, shape ``(*, 10)``.
+def slowing(state: Tensor, action: Tensor, next_state: Tensor, mask: Tensor) -> Tensor:
+    """Return how a moving object loses speed, pushed or not and then away from the hand, L = 18.
 
-    Free sliding loses ``μ g Δt`` of speed per control step. Over the steps at whose start the
-    object moves faster than 2 cm/s, pushed or not: their share, mean speed, mean loss, its mean
-    square, five quantiles of it, and the ratio of summed losses to summed speeds.
+    Free sliding loses ``μ g Δt`` of speed per control step. Both times, over the steps at whose
+    start the object moves faster than 2 cm/s: their share, the mean speed, mean and quantiles of
+    the loss, and the ratio of summed losses to summed speeds. Unlike `recovery_problems.sliding`
+    it looks at one step at a time, so that the steps of several episodes may be put together.
     """
     del action
     before, after = (_object_speed(x) for x in (state, next_state))
     moving = mask & (before > 0.02 * 0.04)
-    loss = torch.where(moving, before - after, torch.nan)
-    speed = torch.where(moving, before, torch.nan)
+    apart = torch.linalg.vector_norm(next_state[..., 6:9], dim=-1) > 0.06
+    parts = [_losses(before, after, steps) for steps in (moving, moving & apart)]
+    return torch.cat(parts, -1)
+
+
+def _losses(before: Tensor, after: Tensor, steps: Tensor) -> Tensor:
+    """Return statistics of the loss of speed over ``steps``, shape ``(*, 9)``; 0 without any."""
+    loss = torch.where(steps, before - after, torch.nan)
+    speed = torch.where(steps, before, torch.nan)
     grid = torch.tensor([0.1, 0.3, 0.5, 0.7, 0.9])
     quantiles = loss.nanquantile(grid, dim=-1).movedim(0, -1)
-    parts = [speed.nanmean(-1), loss.nanmean(-1), loss.square().nanmean(-1).sqrt()]
     ratio = loss.nansum(-1) / speed.nansum(-1).clamp(min=1e-9)
-    share = moving.sum(-1) / mask.sum(-1)
-    values = torch.stack([share, *(100 * part for part in parts), ratio], -1)
-    return torch.cat([values, 100 * quantiles], -1).nan_to_num(0.0)
+    means = [100 * speed.nanmean(-1), 100 * loss.nanmean(-1), ratio]
+    share = steps.double().mean(-1).to(before.dtype)
+    return torch.cat([torch.stack([share, *means], -1), 100 * quantiles], -1).nan_to_num(0.0)
 
 
 def _object_speed(state: Tensor) -> Tensor:
@@ -103,7 +110,7 @@ FETCH: dict[str, GoalTask] = {
         prior=BoxPrior({"friction": (0.1, 1.0)}),
         truth={"friction": 0.3},
         physics=lambda: MujocoPhysics(friction=FRICTION),
-        summaries=(sliding, pushes),
+        summaries=(slowing, pushes),
         warmup=250,
         updates=125,
         budget=600,
@@ -113,7 +120,7 @@ FETCH: dict[str, GoalTask] = {
         prior=BoxPrior({"friction": (0.1, 1.0)}),
         truth={"friction": 0.15},
         physics=lambda: MujocoPhysics(friction=FRICTION),
-        summaries=(sliding, pushes),
+        summaries=(slowing, pushes),
         warmup=300,
         updates=150,
         budget=600,
