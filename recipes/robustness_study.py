@@ -64,6 +64,7 @@ class Study:
             if "score" in point or (index + 1) % max(1, len(trained.curve) // 40) == 0
         ]
         recipe.write(file, json.dumps(recipe.plain(found)))
+        (self.out / f"{source}.pt").unlink()  # with the replay buffer, a hundred megabytes
         return recipe.plain(found)
 
     def _learner(self) -> Any:

@@ -47,6 +47,8 @@ def test_curves_and_paired_differences_are_there(finished):
     pairs = zip(real["posterior"]["values"], real["prior"]["values"], strict=True)
     assert real["posterior minus prior"]["values"] == pytest.approx([a - b for a, b in pairs])
     assert {"provenance", "posteriors"} <= result.keys()
+    kept = {f"{source}_policy.pt" for source in ("prior", "posterior", "oracle")}
+    assert {path.name for path in finished.glob("seed1/*.pt")} == kept | {"posterior_state.pt"}
     assert "| posterior minus prior |" in (finished / "table.md").read_text()
     assert imread(finished / "robustness_damping.png")[..., :3].std() > 0.01
 
