@@ -86,6 +86,17 @@ def test_learning_curves_have_a_band_for_several_seeds_only():
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["many", "one"]
 
 
+@pytest.mark.parametrize(("end", "shown"), [(2.0, "0.5"), (4000.0, "1k")])
+def test_curves_over_physics_have_marks_and_plain_numbers(end, shown, tmp_path):
+    x = torch.linspace(0.0, end, 5)
+    figure = learning_curves({"prior": (x, torch.rand(3, 5))}, marks={"the robot": end / 4})
+    (axes,) = figure.axes
+    assert any(list(line.get_xdata()) == [end / 4, end / 4] for line in axes.lines)
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["prior", "the robot"]
+    figure.savefig(tmp_path / "curves.png")
+    assert any(label.get_text().startswith(shown) for label in axes.get_xticklabels())
+
+
 def test_return_per_round_draws_intervals_and_the_baseline():
     figure = return_per_round(
         [1.0, 2.0], [(0.5, 1.25), (1.5, 2.0)], baseline=0.8, baseline_interval=(0.7, 0.9)
