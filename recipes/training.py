@@ -8,6 +8,7 @@ chosen by its score on episodes of its own; what is reported is scored on others
 from __future__ import annotations
 
 import copy
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -154,11 +155,27 @@ def scored(curve: list[dict[str, float]]) -> list[dict[str, float]]:
 
 
 def first_solved(curve: list[dict[str, float]], least: float) -> dict[str, float] | None:
-    """Return where a curve first scores (or, without scores, returns) at least ``least``."""
-    for point in scored(curve) or curve:
+    """Return where a `thinned` curve first scores, or else returns, at least ``least``."""
+    for point in curve:
         if point.get("score", point["return"]) >= least:
             return {name: point[name] for name in ("frames", "seconds", "cpu_seconds")}
     return None
+
+
+def thinned(curve: list[dict[str, float]], points: int) -> list[dict[str, float]]:
+    """Return the scored points, or as many as asked for: each the mean return of a stretch.
+
+    A stretch in which no episode ended, as when all of them last, has the return before it.
+    """
+    if scored(curve):
+        return scored(curve)
+    size, shown = max(1, len(curve) // points), []
+    for first in range(0, len(curve), size):
+        stretch = curve[first : first + size]
+        ended = [point["return"] for point in stretch if math.isfinite(point["return"])]
+        before = shown[-1]["return"] if shown else float("nan")
+        shown.append({**stretch[-1], "return": sum(ended) / len(ended) if ended else before})
+    return shown
 
 
 def single_thread() -> None:

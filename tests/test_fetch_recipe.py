@@ -148,3 +148,20 @@ def test_training_goes_on_from_its_checkpoint_to_the_same_numbers(recipes, tmp_p
         assert torch.equal(value, again.policy.state_dict()[name])
     # the second score was the best
     assert not all(torch.equal(v, learner.policy.state_dict()[n]) for n, v in whole.best.items())
+
+
+def test_a_thinned_curve_has_means_and_carries_them_over_long_episodes(recipes):
+    from training import first_solved, thinned
+
+    returns = [1.0, 3.0, float("nan"), float("nan"), float("nan"), 9.0]
+    curve = [
+        {"frames": 10.0 * i, "return": value, "seconds": 0.0, "cpu_seconds": 0.0}
+        for i, value in enumerate(returns)
+    ]
+    shown = thinned(curve, 3)
+    assert [point["return"] for point in shown] == [2.0, 2.0, 9.0]
+    assert [point["frames"] for point in shown] == [10.0, 30.0, 50.0]
+    assert first_solved(shown, 8.5)["frames"] == 50.0
+    assert first_solved(shown, 9.5) is None
+    scored = [{**point, "score": 0.5} if point["frames"] == 20 else point for point in curve]
+    assert [point["frames"] for point in thinned(scored, 3)] == [20.0]
