@@ -192,6 +192,16 @@ def test_a_focused_prior_holds_the_posterior_and_stays_in_the_prior():
     assert (narrow.high - narrow.low).item() < 0.3
 
 
+def test_a_negligible_wide_component_does_not_keep_the_focus_wide():
+    sharp, wide = ([0.5], [[1e-4]]), ([0.0], [[1.0]])
+    posterior = mixture(BOX, sharp, wide, weights=[0.9996, 0.0004])
+    focused = focus(BOX, posterior)
+    assert 0.04 < (focused.high - focused.low).item() < 0.5
+    assert focused.contains(torch.tensor([0.5]))
+    everything = focus(BOX, posterior, tail=0.0)
+    assert (everything.high - everything.low).item() > 2
+
+
 # --- the analytic correction
 
 

@@ -90,18 +90,26 @@ def effective_sample_size(weights: Tensor) -> float:
 
 
 def focus(
-    prior: BoxPrior, posterior: PhysicsPosterior, *, margin: float = 1.0, seed: int = 0
+    prior: BoxPrior,
+    posterior: PhysicsPosterior,
+    *,
+    margin: float = 1.0,
+    tail: float = 5e-4,
+    seed: int = 0,
 ) -> BoxPrior:
-    """Return the prior on the smallest box around the posterior's draws, widened.
+    """Return the prior on the smallest box around the posterior's draws but their tails, widened.
 
     The simplest truncated proposal: uniform, so no weights are needed, and a posterior learned on
     the smaller box resolves it better. It is the posterior under the full prior wherever the box
-    holds all of that posterior; the margin allows for a first posterior that is too sure.
+    holds all of that posterior; the margin allows for a first posterior that is too sure. Without
+    the tails, as one wide component of negligible weight would keep the box as wide as the prior.
 
     Args:
         prior: The full prior.
         posterior: The last round's.
         margin: Widening on either side, as a share of the box around 4,096 draws.
+        tail: Share of the draws that may lie below that box before widening, and above, in each
+            parameter.
         seed: Of the draws.
 
     Example:
@@ -114,7 +122,7 @@ def focus(
         (True, True)
     """
     u = prior.standardize(draw(posterior, 4096, key=(seed, "focus")).double())
-    low, high = u.amin(0), u.amax(0)
+    low, high = torch.quantile(u, torch.tensor([tail, 1 - tail], dtype=u.dtype), 0)
     width = (high - low).clamp_min(1e-4)
     edges = prior.unstandardize(torch.stack([low - margin * width, high + margin * width]))
     return prior.within(*edges.to(prior.low.dtype))
@@ -143,7 +151,7 @@ class HighestDensityPrior:
     ) -> None:
         # in a box prior the search is confined to the box around the posterior
         self.prior = (
-            focus(prior, posterior, margin=0.25, seed=seed)
+            focus(prior, posterior, margin=0.25, tail=0.0, seed=seed)
             if isinstance(prior, BoxPrior)
             else prior
         )
