@@ -3,6 +3,8 @@ import gymnasium_robotics
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage
+from torchrl.data.replay_buffers.her import HERReplayBuffer
 
 from torchrl_bayessim.agents.hindsight import HindsightReplayBuffer
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
@@ -155,3 +157,18 @@ def test_unfinished_episodes_are_refused():
 def test_impossible_settings_are_refused(options, match):
     with pytest.raises(ValueError, match=match):
         HindsightReplayBuffer(near, **({"capacity": 10} | options))
+
+
+def test_torchrls_own_buffer_still_fails_when_full():
+    """Once it does not, most of ours can go."""
+    theirs = HERReplayBuffer(
+        lambda step: near(step["achieved_goal"], step["desired_goal"]).unsqueeze(-1),
+        storage=LazyTensorStorage(40),
+    )
+    for first in range(3):
+        theirs.extend(tagged(first, lengths=(15,)).reshape(-1))
+        if first < 2:
+            theirs.sample(10)
+    theirs.extend(tagged(3, lengths=(15,)).reshape(-1))
+    with pytest.raises(RuntimeError):
+        theirs.sample(10)
