@@ -165,10 +165,9 @@ def test_torchrls_own_buffer_still_fails_when_full():
         lambda step: near(step["achieved_goal"], step["desired_goal"]).unsqueeze(-1),
         storage=LazyTensorStorage(40),
     )
-    for first in range(3):
+    for first in range(4):
         theirs.extend(tagged(first, lengths=(15,)).reshape(-1))
-        if first < 2:
-            theirs.sample(10)
-    theirs.extend(tagged(3, lengths=(15,)).reshape(-1))
+        if first == 2:
+            theirs.sample(10)  # full for the first time
     with pytest.raises(RuntimeError):
         theirs.sample(10)
