@@ -7,6 +7,7 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import (
     Compose,
+    GymWrapper,
     ParallelEnv,
     SerialEnv,
     StepCounter,
@@ -301,6 +302,15 @@ def test_wrong_order_or_missing_writer_is_an_error_at_construction(order):
 def test_apply_physics_around_a_batch_is_an_error_at_construction():
     with pytest.raises(TypeError, match="put it inside the function that makes each"):
         TransformedEnv(SerialEnv(2, cartpole), ApplyPhysics(AttributePhysics(*NAMES)))
+
+
+def test_vector_environments_of_gymnasium_are_refused():
+    makers = [lambda: gymnasium.make("CartPole-v1")] * 2
+    mode = gymnasium.vector.AutoresetMode.DISABLED
+    env = GymWrapper(gymnasium.vector.SyncVectorEnv(makers, autoreset_mode=mode))
+    with pytest.raises(PhysicsError, match=r"got 'SyncVectorEnv'\. Try: SerialEnv or ParallelEnv"):
+        TransformedEnv(env, ApplyPhysics(AttributePhysics("length")))
+    env.close()
 
 
 def test_other_names_than_the_writer_are_an_error():

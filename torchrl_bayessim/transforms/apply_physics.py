@@ -7,6 +7,7 @@ __all__ = ["ApplyPhysics"]
 from functools import partial
 
 import torch
+from gymnasium.vector import VectorEnv
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
@@ -29,7 +30,8 @@ class ApplyPhysics(Transform):
         key: The entry that holds θ.
 
     Raises:
-        PhysicsError: The simulator does not have a parameter, or does not hold what was written.
+        PhysicsError: The simulator does not have a parameter, or does not hold what was written; or
+            it is one of gymnasium's vector environments.
         TypeError: It is put around a ``SerialEnv`` or ``ParallelEnv`` and not inside; or
             ``physics`` is no `Physics`.
         ValueError: θ is not finite or has another length than ``physics.names``.
@@ -70,6 +72,10 @@ class ApplyPhysics(Transform):
                     hint="put it inside the function that makes each environment",
                 )
             )
+        if isinstance(env.__dict__.get("_env"), VectorEnv):
+            expected = "a simulator per environment, or one that is batched natively"
+            hint = "SerialEnv or ParallelEnv of environments with num_envs=1, or BatchedMujocoEnv"
+            raise PhysicsError(message(expected, type(env.__dict__["_env"]).__name__, hint=hint))
         # Noted on the environment, where it outlasts transforms and their clones, and where a
         # batched environment finds `physics_names` on its workers' environments.
         if self._nominal(env) is None:
