@@ -29,7 +29,7 @@ def singles(seen: Screen) -> list[dict[Unit, float]]:
 
 def pairs(seen: Screen) -> list[dict[Unit, float]]:
     """Return the pairs of different effects that explain most together."""
-    usable = np.flatnonzero(seen.norms > 0)
+    usable = np.flatnonzero((seen.norms > 0) & (seen.growth == seen.growth.min(initial=np.inf)))
     scores, norms = seen.scores[usable], seen.norms[usable]
     cosine = seen.correlation[np.ix_(usable, usable)]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -66,10 +66,11 @@ def pairs(seen: Screen) -> list[dict[Unit, float]]:
 def groups(seen: Screen) -> list[dict[Unit, float]]:
     """Return each effect at several of its targets, strengths of their own by non-negative fits."""
     found = []
+    usable = (seen.norms > 0) & (seen.growth == seen.growth.min(initial=np.inf))
     for name in dict.fromkeys(unit.name for unit in seen.units):
         best: dict[Unit, int] = {}
         for i, unit in enumerate(seen.units):
-            if unit.name == name and unit.where != "all" and seen.norms[i] > 0:
+            if unit.name == name and unit.where != "all" and usable[i]:
                 known = best.get(unit)
                 best[unit] = i if known is None or seen.scores[i] > seen.scores[known] else known
         if len(best) < 2:

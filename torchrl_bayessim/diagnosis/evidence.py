@@ -203,6 +203,7 @@ def _candidates(
     fitted = {m.units[0]: m for m in selection.tried if len(m.units) == 1}
     used = set(selection.best.units)
     excess = max(seen.residual - seen.effective, 1e-9)
+    growth = dict(zip(seen.units, (seen.growth**2).tolist(), strict=True))
     swallowed: dict[Unit, float] = {}
     for unit, share in zip(seen.units, seen.swallowed.tolist(), strict=True):
         swallowed[unit] = max(swallowed.get(unit, 0.0), share)
@@ -225,7 +226,7 @@ def _candidates(
                 likelihood_ratio=ratio,
                 p_value=float(min(1.0, len(detectable) * np.exp(-ratio / dispersion / 2))),
                 held_out_gain=gain,
-                explained_fraction=float(np.clip(ratio / excess, 0.0, 1.0)),
+                explained_fraction=float(np.clip(ratio * growth[unit] / excess, 0.0, 1.0)),
                 explained_by_parameters=swallowed[unit],
                 minimal_detectable_strength=least if np.isfinite(least) else None,
                 status=_status(

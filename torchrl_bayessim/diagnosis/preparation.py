@@ -31,6 +31,7 @@ _HISTORY = 0.4  # seconds of commands that delay lines and filters look back at
 _ROWS = {"train": 900, "validation": 600, "test": 600}  # control steps simulated per candidate
 _FEWEST = 12  # rows of a run
 _PROBE = 160
+_FEW = 8  # segments on which the parameters are fitted first
 _WORTH = 0.2  # nats per effect that a longer horizon must bring
 
 
@@ -192,7 +193,7 @@ def _noise(
     for _ in range(2):
         white = whitening(predictor, pieces, parameters_at(system.prior, z), noise)
         objective = Objective(predictor, system.prior, pieces, white)
-        fit = refit(objective, [Point(z)], iterations=3)[0]
+        fit = refit(objective, [Point(z)], iterations=4)[0]
         z = fit.point.z
         points = [Point(z, {unit: 0.1 * unit.high}) for unit in pushes]
         pushed = objective(points) if points else np.zeros((0, *fit.innovations.shape))
@@ -256,12 +257,12 @@ def _nominal(
 ) -> tuple[Fit, dict[str, Whitening]]:
     """Fit the parameters, with the whitening and the robust weights that belong to the fit."""
     z = _start(system)
-    white = whitening(predictor, pieces["train"], parameters_at(system.prior, z), noise)
+    every = max(1, len(pieces["train"]) // _FEW)
+    some = pieces["train"].take(np.arange(0, len(pieces["train"]), every))
     for _ in range(2):
-        objective = Objective(predictor, system.prior, pieces["train"], white)
-        plain = refit(objective, [Point(z)], iterations=6)[0]
-        z = plain.point.z
-        white = whitening(predictor, pieces["train"], parameters_at(system.prior, z), noise)
+        white = whitening(predictor, some, parameters_at(system.prior, z), noise)
+        objective = Objective(predictor, system.prior, some, white)
+        z = refit(objective, [Point(z)])[0].point.z
     whitenings = {}
     for name, part in pieces.items():
         bare = whitening(
@@ -270,4 +271,4 @@ def _nominal(
         innovations = Objective(predictor, system.prior, part, bare)([Point(z)])[0]
         whitenings[name] = bare.weighted(innovations)
     objective = Objective(predictor, system.prior, pieces["train"], whitenings["train"])
-    return refit(objective, [Point(z)], iterations=4)[0], whitenings
+    return refit(objective, [Point(z)])[0], whitenings

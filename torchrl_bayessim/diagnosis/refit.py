@@ -1,13 +1,12 @@
-"""Parameters and strengths that explain the segments best: Levenberg-Marquardt, many fits at once.
+"""Parameters and strengths that explain the segments best: many least-squares fits at once.
 
-Every fit of a batch gets the same number of iterations, and all simulations of an iteration (one
-per derivative and fit, then three trial steps per fit) are one call. Derivatives are finite
-differences, which effects such as a delay or a dead band also have.
+All simulations that the fits of a batch ask for in an iteration are one call. Derivatives are
+finite differences, which effects such as a delay or a dead band also have; see `descent`.
 """
 
 from __future__ import annotations
 
-__all__ = ["Fit", "fit_on", "refit"]
+__all__ = ["Fit", "refit"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..inference.priors import BoxPrior
+from .descent import Descent
 from .objective import Objective, Point, Unit
 
 Array = NDArray[np.float64]
-_STEP = 0.01  # of a prior standard deviation, and of an effect's range
-_TRIALS = (1.0, 30.0, 1000.0)  # dampings tried at once, times the present one
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +42,18 @@ class Fit:
     def misfit(self) -> float:
         """``Σ w_i ‖L_i⁻¹ r_i‖²``."""
         return float((self.innovations**2).sum())
+
+    def thinned(self, every: int) -> Fit:
+        """Return what the fit is on every so many segments."""
+        segments, size = len(self.innovations), self.jacobian.shape[1]
+        jacobian = self.jacobian.reshape(segments, -1, size)[::every].reshape(-1, size)
+        return Fit(self.point, self.units, self.innovations[::every], jacobian)
+
+    def beside(self, unit: Unit) -> Fit:
+        """Return the fit with one more unit at zero, of which nothing is known yet."""
+        point = Point(self.point.z, {**self.point.strengths, unit: 0.0})
+        jacobian = np.c_[self.jacobian, np.zeros(len(self.jacobian))]
+        return Fit(point, (*self.units, unit), self.innovations, jacobian)
 
     def covariance(self, dispersion: float) -> Array:
         """Return the covariance of standardised parameters and relative strengths.
@@ -71,81 +81,54 @@ def refit(
     objective: Objective,
     starts: Sequence[Point],
     *,
-    iterations: int = 5,
-    quick: bool = False,
+    origins: Sequence[Fit | None] | None = None,
+    iterations: int = 8,
+    renew: bool = True,
 ) -> list[Fit]:
     """Fit parameters, and the strengths that each start has, from each start.
 
     Args:
         objective: What to make small.
         starts: One per fit; the units in its strengths are the ones to fit.
+        origins: For each start a point near it, with the same units, whose derivatives are known.
         iterations: Steps at most.
-        quick: Spare the derivatives at the end point; the fit's are of the step before.
+        renew: Whether derivatives are made anew where a step fails that they had promised, and
+            before a fit stops.
     """
     models = [tuple(start.strengths) for start in starts]
-    boxes = [_bounds(objective, units) for units in models]
-    vectors = [
-        np.clip(_vector(start, units), *box)
-        for start, units, box in zip(starts, models, boxes, strict=True)
-    ]
-    damping = np.full(len(starts), 1e-3)
-    bases, jacobians = _linearised(objective, models, vectors, boxes)
-    costs = _costs(bases, vectors, objective.size)
-    active = np.ones(len(starts), dtype=bool)
-    for iteration in range(iterations):
-        indices = np.flatnonzero(active)
-        if not len(indices):
-            break
-        trials = [
-            _trial(
-                jacobians[i],
-                bases[i],
-                vectors[i],
-                boxes[i],
-                damping=damping[i] * factor,
-                size=objective.size,
-            )
-            for i in indices
-            for factor in _TRIALS
-        ]
-        owners = [i for i in indices for _ in _TRIALS]
-        residuals = objective(
-            [_point(v, models[i], objective.size) for v, i in zip(trials, owners, strict=True)]
+    descents = [
+        Descent(
+            _vector(start, units),
+            _bounds(objective, units),
+            size=objective.size,
+            origin=None if origin is None else _origin(origin, units),
+            renew=renew,
         )
-        moved = []
-        for n, i in enumerate(indices):
-            part = slice(n * len(_TRIALS), (n + 1) * len(_TRIALS))
-            found = _costs(residuals[part], trials[part], objective.size)
-            best = int(np.argmin(found))
-            if found[best] < costs[i]:
-                gain = costs[i] - found[best]
-                vectors[i], costs[i] = trials[part][best], found[best]
-                bases[i] = residuals[part][best]
-                damping[i] *= (0.1, 3.0, 100.0)[best]
-                moved.append(i)
-                active[i] = gain > 1e-3 + 1e-4 * costs[i]
-            else:
-                damping[i] *= 1e4
-                active[i] = damping[i] < 1e4
-        if moved and not (quick and iteration == iterations - 1):
-            some = [vectors[i] for i in moved]
-            new = _linearised(
-                objective, [models[i] for i in moved], some, [boxes[i] for i in moved]
-            )
-            for i, base, jacobian in zip(moved, *new, strict=True):
-                bases[i], jacobians[i] = base, jacobian
+        for start, units, origin in zip(
+            starts, models, origins or [None] * len(starts), strict=True
+        )
+    ]
+    for _ in range(1 + iterations):
+        asked = [descent.ask() for descent in descents]
+        points = [
+            _point(vector, units, objective.size)
+            for units, vectors in zip(models, asked, strict=True)
+            for vector in vectors
+        ]
+        if not points:
+            break
+        residuals = iter(objective(points))
+        for descent, vectors in zip(descents, asked, strict=True):
+            if vectors:
+                descent.tell([next(residuals) for _ in vectors])
     return [
-        Fit(_point(v, units, objective.size), units, base, jacobian)
-        for v, units, base, jacobian in zip(vectors, models, bases, jacobians, strict=True)
+        Fit(_point(d.vector, units, objective.size), units, d.residual, d.jacobian)
+        for d, units in zip(descents, models, strict=True)
     ]
 
 
-def fit_on(objective: Objective, fit: Fit) -> Fit:
-    """Return the innovations and derivatives of a fit on another objective's segments."""
-    vector = _vector(fit.point, fit.units)
-    box = _bounds(objective, fit.units)
-    bases, jacobians = _linearised(objective, [fit.units], [vector], [box])
-    return Fit(fit.point, fit.units, bases[0], jacobians[0])
+def _origin(fit: Fit, units: tuple[Unit, ...]) -> tuple[Array, Array, Array]:
+    return _vector(fit.point, units), fit.innovations, fit.jacobian
 
 
 def _bounds(objective: Objective, units: tuple[Unit, ...]) -> tuple[Array, Array]:
@@ -164,68 +147,3 @@ def _vector(point: Point, units: tuple[Unit, ...]) -> Array:
 def _point(vector: Array, units: tuple[Unit, ...], size: int) -> Point:
     relative = vector[size:].tolist()
     return Point(vector[:size], {u: r * u.high for u, r in zip(units, relative, strict=True)})
-
-
-def _costs(
-    innovations: Sequence[Array] | Array, vectors: Sequence[Array], size: int
-) -> list[float]:
-    return [
-        float((r**2).sum() + (v[:size] ** 2).sum())
-        for r, v in zip(innovations, vectors, strict=True)
-    ]
-
-
-def _linearised(
-    objective: Objective,
-    models: Sequence[tuple[Unit, ...]],
-    vectors: Sequence[Array],
-    boxes: Sequence[tuple[Array, Array]],
-) -> tuple[list[Array], list[Array]]:
-    """Return innovations and their derivatives at each vector, simulated together."""
-    points, steps = [], []
-    for units, vector, (_, high) in zip(models, vectors, boxes, strict=True):
-        points.append(_point(vector, units, objective.size))
-        for d in range(len(vector)):
-            step = -_STEP if vector[d] + _STEP > high[d] else _STEP
-            moved = vector.copy()
-            moved[d] += step
-            points.append(_point(moved, units, objective.size))
-            steps.append(step)
-    residuals = objective(points)
-    bases, jacobians, at, number = [], [], 0, 0
-    for vector in vectors:
-        base = residuals[at]
-        columns = [
-            (residuals[at + 1 + d] - base).ravel() / steps[number + d] for d in range(len(vector))
-        ]
-        bases.append(base)
-        jacobians.append(np.stack(columns, 1) if columns else np.zeros((base.size, 0)))
-        at, number = at + 1 + len(vector), number + len(vector)
-    return bases, jacobians
-
-
-def _trial(
-    jacobian: Array,
-    innovations: Array,
-    vector: Array,
-    box: tuple[Array, Array],
-    *,
-    damping: float,
-    size: int,
-) -> Array:
-    """Return the damped Gauss-Newton step's end, inside the bounds."""
-    if not len(vector):
-        return vector
-    prior = np.zeros(len(vector))
-    prior[:size] = 1.0
-    normal = jacobian.T @ jacobian + np.diag(prior)
-    gradient = jacobian.T @ innovations.ravel() + prior * vector
-    # coordinates at a bound that the gradient pushes against stay there
-    pinned = ((vector <= box[0]) & (gradient > 0)) | ((vector >= box[1]) & (gradient < 0))
-    free = ~pinned
-    step = np.zeros(len(vector))
-    if free.any():
-        part = normal[np.ix_(free, free)]
-        part = part + damping * np.diag(np.diag(part) + 1e-9)
-        step[free] = -np.linalg.solve(part, gradient[free])
-    return np.clip(vector + step, *box)

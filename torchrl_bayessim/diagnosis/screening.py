@@ -9,6 +9,9 @@ that the parameters can explain projected out::
 a score test with finite strengths in place of derivatives, which also works for delays and dead
 bands (Rao 1948; nuisance rejection as in Basseville & Nikiforov 1993, ch. 7). The null of the
 largest LR is drawn from the signatures' own correlations, and so accounts for the search.
+
+Where there are many segments, all units are first compared on some of them, and what stands out, or
+could in a pair, on all.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from __future__ import annotations
 __all__ = ["Screen", "screen"]
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +45,9 @@ class Screen:
         swallowed: Share of each signature that parameters would explain, shape ``(G,)``.
         residual: ``‖r̃_⊥‖²``, what the parameters leave.
         effective: Number of innovations.
-        directions: Unit signatures, shape ``(G, n)``, for the report.
+        changes: What each simulation changed of the innovations, shape ``(S, KC)`` each.
+        growth: How much larger the norm of each would be on all segments, shape ``(G,)``: 1 for
+            those that were compared there.
     """
 
     units: tuple[Unit, ...]
@@ -53,7 +58,8 @@ class Screen:
     swallowed: Array
     residual: float
     effective: int
-    directions: Array
+    changes: tuple[NDArray[np.float32], ...]
+    growth: Array
 
     def ratios(self, dispersion: float) -> Array:
         """Return the likelihood ratio of each signature, shape ``(G,)``."""
@@ -90,12 +96,62 @@ class Screen:
         between levels by power laws, ``inf`` where even the highest level is not seen.
         """
         threshold = np.sqrt(2 * np.log(max(len(set(self.units)), 2) / alpha)) + _POWER
+        norms = self.norms * self.growth
         result: dict[Unit, float] = {}
         for unit in dict.fromkeys(self.units):
             rows = [i for i, u in enumerate(self.units) if u == unit and self.strengths[i] > 0]
             rows.sort(key=lambda i: self.strengths[i])
-            result[unit] = _crossing(self.strengths[rows], self.norms[rows], threshold)
+            result[unit] = _crossing(self.strengths[rows], norms[rows], threshold)
         return result
+
+    def origin(self, fit: Fit, added: Sequence[Unit]) -> Fit | None:
+        """Return the fit with units added at strength zero, derivatives by the screen's changes.
+
+        Nothing where a unit was not compared on the segments of the fit.
+        """
+        columns = [fit.jacobian]
+        for unit in added:
+            rows = [
+                i
+                for i, u in enumerate(self.units)
+                if u == unit and self.changes[i].shape == fit.innovations.shape
+            ]
+            if not rows:
+                return None
+            row = max(rows, key=lambda i: self.scores[i])
+            relative = self.strengths[row] / unit.high
+            columns.append(self.changes[row].reshape(-1, 1) / relative)
+        point = Point(fit.point.z, {**fit.point.strengths, **dict.fromkeys(added, 0.0)})
+        return Fit(point, tuple(point.strengths), fit.innovations, np.concatenate(columns, 1))
+
+    def grown(self, every: int) -> Screen:
+        """Return this screen of every so many segments as one of all."""
+        return replace(
+            self,
+            residual=self.residual * every,
+            effective=self.effective * every,
+            growth=self.growth * np.sqrt(every),
+        )
+
+    def joined(self, coarse: Screen, every: int) -> Screen:
+        """Return this screen with the units that only a screen of every so many segments has."""
+        mine = set(self.units)
+        rows = np.array([i for i, unit in enumerate(coarse.units) if unit not in mine], dtype=int)
+        size = len(self.units)
+        correlation = np.eye(size + len(rows))
+        correlation[:size, :size] = self.correlation
+        correlation[size:, size:] = coarse.correlation[np.ix_(rows, rows)]
+        return replace(
+            self,
+            units=self.units + tuple(coarse.units[i] for i in rows),
+            strengths=np.r_[self.strengths, coarse.strengths[rows]],
+            norms=np.r_[self.norms, coarse.norms[rows]],
+            scores=np.r_[self.scores, coarse.scores[rows]],
+            correlation=correlation,
+            swallowed=np.r_[self.swallowed, coarse.swallowed[rows]],
+            changes=self.changes + tuple(coarse.changes[i] for i in rows),
+            growth=np.r_[self.growth, np.full(len(rows), np.sqrt(every))],
+        )
 
 
 def screen(objective: Objective, fit: Fit, units: Sequence[Unit]) -> Screen:
@@ -106,60 +162,59 @@ def screen(objective: Objective, fit: Fit, units: Sequence[Unit]) -> Screen:
         fit: What is in the model already; its units are projected out like parameters.
         units: The effects to try.
     """
-    rows = [(unit, level) for unit in units for level in _levels(unit)]
-    rest = fit.innovations.ravel()
-    basis = _basis(fit, objective.size)
-    left = np.r_[rest, -_prior_part(fit, objective.size)]
-    left = left - basis @ (basis.T @ left)
-    norms, scores, swallowed = [], [], []
-    directions = np.zeros((len(rows), len(left)), dtype=np.float32)
-    chunk = max(1, 40_000_000 // max(len(rest), 1))
+    rows = [(unit, level * unit.high) for unit in units for level in LEVELS]
+    rows += [(unit, LEVELS[-1] * unit.low) for unit in units if unit.low < 0]
+    strengths = fit.point.strengths
+    changes = []
+    chunk = max(1, 40_000_000 // max(fit.innovations.size, 1))
     for begin in range(0, len(rows), chunk):
-        part = rows[begin : begin + chunk]
         points = [
-            Point(fit.point.z, {**fit.point.strengths, unit: _added(fit, unit, level)})
-            for unit, level in part
+            Point(fit.point.z, {**strengths, unit: strengths.get(unit, 0.0) + level})
+            for unit, level in rows[begin : begin + chunk]
         ]
-        simulated = objective(points)
-        for i, innovations in enumerate(simulated):
-            change = np.r_[rest - innovations.ravel(), np.zeros(objective.size)]
-            before = float(np.linalg.norm(change))
-            if not np.isfinite(before) or (np.abs(innovations).max(-1) > 500).any():
+        for innovations in objective(points):
+            change = (innovations - fit.innovations).astype(np.float32)
+            if not np.isfinite(change).all() or (np.abs(innovations).max(-1) > 500).any():
                 change = np.zeros_like(change)  # a diverged simulation explains nothing
-            change -= basis @ (basis.T @ change)
-            norm = float(np.linalg.norm(change))
-            seen = norm > 1e-6 * max(before, 1.0) and norm > 1e-6
-            directions[begin + i] = change / norm if seen else 0.0
-            norms.append(norm if seen else 0.0)
-            scores.append(float(change @ left) / norm if seen else 0.0)
-            swallowed.append(1 - (norm / before) ** 2 if before > 0 and seen else 0.0)
-    correlation = (directions @ directions.T).astype(np.float64)
+            changes.append(change)
+    # little of an effect does the opposite of as little of its opposite
+    small = [i for i, (unit, level) in enumerate(rows) if unit.low < 0 < level < unit.high / 10]
+    rows += [(rows[i][0], LEVELS[0] * rows[i][0].low) for i in small]
+    changes += [changes[i] * np.float32(rows[i][0].low / rows[i][0].high) for i in small]
+    return _compared(rows, changes, fit, objective.size)
+
+
+def _compared(
+    rows: Sequence[tuple[Unit, float]],
+    changes: Sequence[NDArray[np.float32]],
+    fit: Fit,
+    size: int,
+) -> Screen:
+    """Return the screen of what simulations changed."""
+    basis = _basis(fit, size)
+    left = np.r_[fit.innovations.ravel(), -fit.point.z[:size]]
+    left = left - basis @ (basis.T @ left)
+    flat = -np.stack([np.r_[c.ravel(), np.zeros(size)] for c in changes]) if changes else None
+    if flat is None:
+        flat = np.zeros((0, len(left)))
+    before = np.linalg.norm(flat, axis=1)
+    flat -= (flat @ basis) @ basis.T
+    norms = np.linalg.norm(flat, axis=1)
+    seen = (norms > 1e-6 * np.maximum(before, 1.0)) & (norms > 1e-6)
+    norms = np.where(seen, norms, 0.0)
+    directions = np.where(seen, 1 / np.where(seen, norms, 1.0), 0.0)[:, None] * flat
     return Screen(
-        tuple(unit for unit, _ in rows),
-        np.array([level for _, level in rows]),
-        np.array(norms),
-        np.array(scores),
-        correlation,
-        np.array(swallowed),
-        float(left @ left),
-        len(rest),
-        directions[:, : len(rest)].astype(np.float64),
+        units=tuple(unit for unit, _ in rows),
+        strengths=np.array([level for _, level in rows]),
+        norms=norms,
+        scores=directions @ left,
+        correlation=directions @ directions.T,
+        swallowed=np.where(seen, 1 - (norms / np.where(seen, before, 1.0)) ** 2, 0.0),
+        residual=float(left @ left),
+        effective=fit.innovations.size,
+        changes=tuple(changes),
+        growth=np.ones(len(rows)),
     )
-
-
-def _levels(unit: Unit) -> list[float]:
-    levels = [level * unit.high for level in LEVELS]
-    if unit.low < 0:
-        levels += [level * unit.low for level in LEVELS]
-    return levels
-
-
-def _added(fit: Fit, unit: Unit, level: float) -> float:
-    return fit.point.strengths.get(unit, 0.0) + level
-
-
-def _prior_part(fit: Fit, size: int) -> Array:
-    return fit.point.z[:size]
 
 
 def _basis(fit: Fit, size: int) -> Array:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 __all__ = ["Model", "Selection", "as_good", "select"]
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -19,24 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..effects.effect import ForceEffect
-from .additions import groups, pairs, singles
+from .explanations import compare, explanations
 from .objective import Objective, Point, Unit
-from .refit import Fit, fit_on, refit
-from .screening import Screen, screen
+from .refit import Fit, refit
+from .screening import Screen
 
 Array = NDArray[np.float64]
 _LIKELY = 6.0  # a deviance that chance often makes
 _DEVIATIONS = 2.3  # of a normal distribution: one in a hundred
 _SHARE = 0.1  # of the gap: what an effect that could be another must remove to be kept
 _REST = 0.5  # of what the base leaves: what any further effect must remove
+_REMAINS = 0.01  # of the gap: not worth another effect
 _WRONG = 1.5  # mean squared innovation of a base that something is missing from
 _MOST = 4  # effects in one explanation
 _RIVALS = 6  # models with another effect in the place of one
-_SURVIVORS = 7  # models of a round that are fitted to the end
-_MANY, _APART, _MATTER = 150, 4, 8  # units, targets of one effect, effects to look at singly
-_FEW = 8  # segments on which a round begins
-_BENT = 5.0  # mean squared innovation of a nominal fit that may have gone astray
-_TYPICAL = 0.2  # of an effect's range, to start from
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,13 +107,14 @@ def select(
     for round_number in range(_MOST):
         progress(f"screening {len(units)} effects, round {round_number + 1}")
         left = [u for u in units if u not in best.units]
-        seen = _screened(train, best.fit, left)
-        screens.append(seen)
-        p_values.append(_p_value(seen, best, generator))
-        if p_values[-1] > alpha:
+        enough = _all_explained(start, best)
+        now = compare(train, best.fit, left, glance=enough)
+        screens.append(now.seen)
+        p_values.append(_p_value(now.seen, best, generator))
+        if p_values[-1] > alpha or enough:
             break
         progress("fitting explanations")
-        models = _explanations(train, validation, best, seen)
+        models = _judged(validation, explanations(train, now))
         tried += models
         better = _needed_only(start, best, _chosen(best, models), models)
         if better is None or not _identified(start, best, better, models):
@@ -135,6 +131,15 @@ def select(
     return Selection(start, best, tuple(screens), tuple(p_values), tuple(tried), alternatives)
 
 
+def _all_explained(start: Model, best: Model) -> bool:
+    """Return whether too little of the gap is left to be a cause of its own.
+
+    The true law in a simulator that integrates differently leaves as much.
+    """
+    alone, left = (float((m.fit.innovations**2).mean()) - 1.0 for m in (start, best))
+    return bool(best.units) and left < _REMAINS * alone
+
+
 def _exactly(train: Objective, validation: Objective, model: Model) -> Model:
     """Fit a model with forces that follow the state at every time step, if it has any.
 
@@ -144,19 +149,7 @@ def _exactly(train: Objective, validation: Objective, model: Model) -> Model:
     if not forced or train.predictor.exact:
         return model
     train.predictor.exact = validation.predictor.exact = True
-    return _judged(validation, refit(train, [model.fit.point], iterations=2))[0]
-
-
-def _screened(train: Objective, fit: Fit, units: Sequence[Unit]) -> Screen:
-    """Screen units; on a robot of many joints single ones only for the effects that matter."""
-    if len(units) <= _MANY:
-        return screen(train, fit, units)
-    counts = Counter(unit.name for unit in units)
-    whole = [u for u in units if u.where == "all" or counts[u.name] <= _APART]
-    best = screen(train.thinned(2), fit_on(train.thinned(2), fit), whole).best(1.0)
-    order = sorted(best, key=lambda unit: -best[unit][0])
-    names = list(dict.fromkeys(unit.name for unit in order))[:_MATTER]
-    return screen(train, fit, [u for u in units if u in whole or u.name in names])
+    return _judged(validation, refit(train, [model.fit.point], iterations=4))[0]
 
 
 def _p_value(seen: Screen, model: Model, generator: np.random.Generator) -> float:
@@ -172,45 +165,6 @@ def _p_value(seen: Screen, model: Model, generator: np.random.Generator) -> floa
     # beyond the draws: the tail of a maximum falls like exp(-x/2)
     tail = np.quantile(null, 0.98)
     return float(0.02 * np.exp(-(largest - tail) / 2))
-
-
-def _explanations(
-    train: Objective, validation: Objective, base: Model, seen: Screen
-) -> list[Model]:
-    """Fit what may be added to the base model: first many for a few steps, then the best on.
-
-    Where the gap is large the screen's linear view from a bent nominal fit can mislead. So every
-    effect gets a try, from there and from the prior's centre, before most are dropped (successive
-    halving: all models of a rung get the same number of simulations).
-    """
-    middle = np.zeros_like(base.fit.point.z)
-    far = not base.units and len(middle) and (base.fit.innovations**2).mean() > _BENT
-    starts = []
-    for on in [*singles(seen), *pairs(seen), *groups(seen)]:
-        starts.append(Point(base.fit.point.z, {**base.fit.point.strengths, **on}))
-        if len(on) == 1 and far:
-            unit, strength = next(iter(on.items()))
-            typical = float(np.sign(strength) * _TYPICAL * unit.high)
-            starts.append(Point(middle, {unit: typical}))
-    kept = starts
-    if len(starts) > _SURVIVORS:
-        some = train.thinned(max(1, len(train.segments) // _FEW))
-        kept = [fit.point for fit in _fittest(refit(some, starts, iterations=1, quick=True))]
-    return _judged(validation, refit(train, kept, iterations=3))
-
-
-def _fittest(fits: Sequence[Fit]) -> list[Fit]:
-    """Return the best fits, of every set of effects two at most."""
-    kept: list[Fit] = []
-    names: list[frozenset[str]] = []
-    for fit in sorted(fits, key=lambda f: f.misfit + 4.0 * len(f.units)):
-        name = frozenset(u.name for u in fit.units)
-        if names.count(name) < 2 and not any(set(fit.units) == set(f.units) for f in kept):
-            kept.append(fit)
-            names.append(name)
-        if len(kept) == _SURVIVORS:
-            break
-    return kept
 
 
 def _fitted(
@@ -337,8 +291,7 @@ def _alternatives(
             fits = refit(train, [Point(best.fit.point.z, kept)])
             base = _judged(validation, fits)[0]
             left = [u for u in units if u not in kept and u.name != name]
-            seen = _screened(train, base.fit, left)
-            strongest = seen.best(1.0)
+            strongest = compare(train, base.fit, left).seen.best(1.0)
             order = sorted(strongest, key=lambda unit: -strongest[unit][0])
             additions: dict[str, dict[Unit, float]] = {}
             for unit in order:

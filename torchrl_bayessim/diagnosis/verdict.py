@@ -4,7 +4,7 @@ A goodness-of-fit test always rejects in the end, so the verdict weighs how larg
 how much of it the effects explain, not only whether it is significant::
 
     none           nothing significant, or an excess below 5 % of the noise floor
-    named          effects explain at least 80 %, and what is left is not significant
+    named          effects explain at least 80 %, and what is left is not significant, or 2 %
     named_partial  effects explain at least half; the rest is located
     ambiguous      effects of different kinds explain the data equally well
     unknown        the gap is real, and the catalogue does not explain half of it
@@ -28,7 +28,7 @@ from .shrinkage import Shrinkage
 
 _NEGLIGIBLE = 0.05  # of the noise floor: an excess that no one would chase
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
-_NAMED, _PARTIAL = 0.8, 0.5
+_ALL, _NAMED, _PARTIAL = 0.98, 0.8, 0.5
 
 
 def conclude(
@@ -51,7 +51,7 @@ def conclude(
     splits = [float((m**2).mean()) for m in
               (selection.nominal.fit.innovations, selection.nominal.validation)]  # fmt: skip
     visible = measured.excess_ci[0] > 0 and min(measured.refit, *splits) > _UNEXPLAINED
-    left = measured.remainder_ci[0] > _NEGLIGIBLE
+    left = measured.remainder_ci[0] > _NEGLIGIBLE and measured.explained < _ALL
     verdict: Verdict
     if not _excited(system, prepared):
         verdict = "not_testable"

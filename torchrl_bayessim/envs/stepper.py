@@ -139,9 +139,10 @@ class Stepper:
         drive = Drive() if drive is None else drive
         sites = [name for name in outputs if name.startswith("site_velocity[")]
         arrays = tuple(name for name in outputs if name not in sites)
-        threads = min(threads or len(os.sched_getaffinity(0)), num_envs)
-        self._workers = [_Worker(model, arrays) for _ in range(threads)]
-        self._pool = ThreadPoolExecutor(max(1, threads - 1))
+        self._threads = threads or len(os.sched_getaffinity(0))
+        self._hire = lambda: _Worker(model, arrays)
+        self._workers = [self._hire()]
+        self._pool = ThreadPoolExecutor(max(1, self._threads - 1))
         self._queue = np.zeros(1, dtype=np.int64)
         self._drive = _resolve(model, drive, sites)
         self._sharing = sharing
@@ -154,12 +155,14 @@ class Stepper:
         data = mujoco.MjData(model)
         mujoco.mj_getState(model, data, self.initial[:size], _SIGNATURE)
         _try_out(model, data)
-        self.models = ModelBatch(model, num_envs // sharing, threads=threads)
+        self.models = ModelBatch(model, num_envs // sharing, threads=self._threads)
         self.resize(num_envs)
 
     def resize(self, num_envs: int) -> None:
         """Change the number of simulations; all start anew, and new physics are nominal."""
         self.num_envs = num_envs
+        while len(self._workers) < min(self._threads, num_envs):
+            self._workers.append(self._hire())
         self.models.resize(num_envs // self._sharing)
         self.state = np.tile(self.initial, (num_envs, 1))
         self.outputs = np.zeros((num_envs, 1, self.output_size))

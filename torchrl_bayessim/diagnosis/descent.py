@@ -1,0 +1,166 @@
+"""One Levenberg-Marquardt fit that is told what it asked for, so that many can run side by side.
+
+Derivatives cost a simulation per coordinate, so they are made once and then updated by what each
+step taught (Broyden 1965)::
+
+    J ← J + (Δr − J Δx) Δxᵀ / ‖Δx‖²,
+
+and made anew only where a step fails that they had promised, or at the end.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Descent"]
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+_STEP = 0.01  # of a prior standard deviation, and of an effect's range
+_CAREFUL = (3.0, 100.0)  # dampings tried after a step that failed, times the one before
+_STUCK = 1e4  # damping beyond which there is nothing to gain
+
+
+class Descent:
+    """Minimises ``‖r(x)‖² + Σ_{i<size} x_i²`` between bounds, asking for ``r`` where it needs it.
+
+    Args:
+        vector: Where to begin, shape ``(n,)``.
+        bounds: Lowest and highest ``x``, shape ``(n,)`` each.
+        size: The first coordinates, which have a standard normal prior.
+        origin: A point, ``r`` there and its Jacobian ``(m, n)``, from which the beginning is the
+            first step; without it derivatives are made at the beginning.
+        renew: Whether derivatives are made anew where the updated ones fail, and before it stops.
+
+    Attributes:
+        vector: The best point so far.
+        residual: ``r`` there, of any shape with ``m`` numbers.
+        jacobian: Its derivative, shape ``(m, n)``, approximately.
+        done: Whether nothing more is to be gained.
+    """
+
+    def __init__(
+        self,
+        vector: Array,
+        bounds: tuple[Array, Array],
+        *,
+        size: int,
+        origin: tuple[Array, Array, Array] | None = None,
+        renew: bool = True,
+    ) -> None:
+        self._low, self._high = bounds
+        self.vector = np.clip(vector, *bounds)
+        self._size, self._renew = size, renew
+        self._damping, self._factors = 1e-3, (1.0,)
+        self._asked: list[Array] = []
+        self._origin = origin
+        self._stage = "begin"
+        self._fresh = self.done = False
+        self.cost = np.inf
+
+    def ask(self) -> list[Array]:
+        """Return points at which residuals are wanted, none where it is done."""
+        if self.done:
+            self._asked = []
+        elif self._stage == "begin":
+            self._asked = [self.vector] if self._origin is not None else self._around()
+        elif self._stage == "renew":
+            self._asked = self._around()[1:]
+        else:
+            self._asked = [self._trial(self._damping * factor) for factor in self._factors]
+        return self._asked
+
+    def tell(self, residuals: Sequence[Array]) -> None:
+        """Take the residuals at the points asked for."""
+        if self._stage == "begin":
+            self._begin(residuals)
+        elif self._stage == "renew":
+            self._renewed(residuals)
+        else:
+            self._tried(residuals)
+
+    def _around(self) -> list[Array]:
+        points = [self.vector]
+        for d in range(len(self.vector)):
+            moved = self.vector.copy()
+            moved[d] += self._step(d)
+            points.append(moved)
+        return points
+
+    def _step(self, d: int) -> float:
+        return -_STEP if self.vector[d] + _STEP > self._high[d] else _STEP
+
+    def _begin(self, residuals: Sequence[Array]) -> None:
+        self.residual, self.cost = residuals[0], self._price(residuals[0], self.vector)
+        if self._origin is None:
+            self._renewed(residuals[1:])
+            return
+        vector, residual, jacobian = self._origin
+        self._stage, self.jacobian = "step", jacobian
+        self._learn(self.vector - vector, residuals[0] - residual)
+
+    def _renewed(self, residuals: Sequence[Array]) -> None:
+        columns = [(r - self.residual).ravel() / self._step(d) for d, r in enumerate(residuals)]
+        empty = np.zeros((self.residual.size, 0))
+        self.jacobian = np.stack(columns, 1) if columns else empty
+        self._stage, self._fresh, self._factors = "step", True, (1.0,)
+        self._damping = min(self._damping, 1e-1)
+        self.done = not columns
+
+    def _tried(self, residuals: Sequence[Array]) -> None:
+        costs = [self._price(r, v) for r, v in zip(residuals, self._asked, strict=True)]
+        best = int(np.argmin(costs))
+        if costs[best] >= self.cost:
+            self._failed()
+            return
+        gain = self.cost - costs[best]
+        moved, change = self._asked[best] - self.vector, residuals[best] - self.residual
+        self.vector, self.residual, self.cost = self._asked[best], residuals[best], costs[best]
+        self._damping = max(self._damping * self._factors[best] * 0.1, 1e-9)
+        self._factors = (1.0,)
+        self._learn(moved, change)
+        if gain <= 1e-3 + 1e-4 * self.cost:
+            self._settle()
+
+    def _failed(self) -> None:
+        if not self._fresh and self._renew:
+            self._stage = "renew"
+            return
+        self._damping *= _CAREFUL[-1] if len(self._factors) > 1 else 1.0
+        self._factors = _CAREFUL
+        self.done = self._damping > _STUCK
+
+    def _settle(self) -> None:
+        """Stop, or make sure of the derivatives first."""
+        if self._renew and not self._fresh:
+            self._stage = "renew"
+        else:
+            self.done = True
+
+    def _learn(self, moved: Array, change: Array) -> None:
+        length = float(moved @ moved)
+        if length > 0:
+            wrong = change.ravel() - self.jacobian @ moved
+            self.jacobian = self.jacobian + np.outer(wrong, moved / length)
+            self._fresh = False
+
+    def _price(self, residual: Array, vector: Array) -> float:
+        return float((residual**2).sum() + (vector[: self._size] ** 2).sum())
+
+    def _trial(self, damping: float) -> Array:
+        """Return the damped Gauss-Newton step's end, inside the bounds."""
+        prior = np.zeros(len(self.vector))
+        prior[: self._size] = 1.0
+        normal = self.jacobian.T @ self.jacobian + np.diag(prior)
+        gradient = self.jacobian.T @ self.residual.ravel() + prior * self.vector
+        # coordinates at a bound that the gradient pushes against stay there
+        low, high = self.vector <= self._low, self.vector >= self._high
+        free = ~((low & (gradient > 0)) | (high & (gradient < 0)))
+        step = np.zeros(len(self.vector))
+        if free.any():
+            part = normal[np.ix_(free, free)]
+            part = part + damping * np.diag(np.diag(part) + 1e-9)
+            step[free] = -np.linalg.solve(part, gradient[free])
+        return np.clip(self.vector + step, self._low, self._high)

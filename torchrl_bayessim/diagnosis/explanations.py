@@ -1,0 +1,148 @@
+"""What may explain the data beside what is in the model already: compared, then fitted, in rungs.
+
+Simulations are spent where they tell: all units are compared on some of the segments and what
+stands out on all; all explanations are fitted there for a few steps, the best on all segments, and
+the best of those to the end (successive halving, Jamieson & Talwalkar 2016).
+"""
+
+from __future__ import annotations
+
+__all__ = ["Round", "compare", "explanations"]
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .additions import groups, pairs, singles
+from .objective import Objective, Point, Unit
+from .refit import Fit, refit
+from .screening import Screen, screen
+
+_PROMISING = 24  # explanations that are fitted on some segments
+_SURVIVORS, _FINALISTS = 7, 4  # that are fitted on all segments, and to the end
+_MANY, _APART, _MATTER = 150, 4, 8  # units, targets of one effect, effects to look at singly
+_FEW, _EVERY = 8, 4  # segments on which a round begins at least, and which share at least
+_BENT = 5.0  # mean squared innovation of a nominal fit that may have gone astray
+_TYPICAL = 0.2  # of an effect's range, to start from
+_NEAR = 0.3  # prior standard deviations within which derivatives may hold
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """A fit compared with what may be added to it.
+
+    Attributes:
+        base: The fit, with all its segments.
+        seen: All units, those that matter on all segments.
+        thin: Some of the segments.
+        coarse: All units on those.
+        every: Every so many segments are among them.
+    """
+
+    base: Fit
+    seen: Screen
+    thin: Objective
+    coarse: Screen
+    every: int
+
+
+def compare(train: Objective, base: Fit, units: Sequence[Unit], *, glance: bool = False) -> Round:
+    """Screen units on some segments, then what may matter on all.
+
+    Args:
+        train: The segments.
+        base: What is in the model already.
+        units: What may be missing.
+        glance: Look at some segments only; as it does anyway where the gap is large.
+    """
+    every = int(np.clip(round(len(train.segments) / _FEW), 1, _EVERY))
+    thin, fit = train.thinned(every), base.thinned(every)
+    if len(units) > _MANY:  # single ones only of the effects that matter
+        counts = Counter(unit.name for unit in units)
+        whole = [u for u in units if u.where == "all" or counts[u.name] <= _APART]
+        best = screen(thin.thinned(2), fit.thinned(2), whole).best(1.0)
+        order = sorted(best, key=lambda unit: -best[unit][0])
+        names = list(dict.fromkeys(unit.name for unit in order))[:_MATTER]
+        units = [u for u in units if u in whole or u.name in names]
+    coarse = screen(thin, fit, units)
+    if glance or every == 1 or _bent(base):
+        return Round(base, coarse.grown(every), thin, coarse, every)
+    best = coarse.best(1.0)
+    first = sorted(best, key=lambda unit: -best[unit][0])[:_MATTER]
+    together = [unit for on in [*pairs(coarse), *groups(coarse)] for unit in on]
+    picks = list(dict.fromkeys([*first, *together]))
+    fine = screen(train, base, picks)
+    return Round(base, fine.joined(coarse, every), thin, coarse, every)
+
+
+def explanations(train: Objective, now: Round) -> list[Fit]:
+    """Fit what may be added to the base: first many for a few steps, then the best on.
+
+    Where the gap is large the screen's linear view from a bent nominal fit can mislead. So every
+    effect gets a try, from there and from the prior's centre, before most are dropped.
+    """
+    base = now.base
+    starts, origins = _starts(now)
+    tried = refit(now.thin, starts, origins=origins, iterations=0, renew=False)
+    tried = sorted(tried, key=_promise)[:_PROMISING]
+    starts = [fit.point for fit in tried]
+    tried = refit(now.thin, starts, origins=tried, iterations=4 if _bent(base) else 2, renew=False)
+    if _bent(base):  # a few segments say enough
+        return refit(train, [fit.point for fit in _fittest(tried, _FINALISTS)])
+    starts = [fit.point for fit in _fittest(tried, _SURVIVORS)]
+    known: list[Fit | None] = []
+    for point in starts:
+        on = [unit for unit in point.strengths if unit not in base.units]
+        near = np.abs(point.z - base.point.z).max() < _NEAR
+        known.append(now.seen.origin(base, on) if near else None)
+    tried = refit(train, starts, origins=known, iterations=2, renew=False)
+    best = _fittest(tried, _FINALISTS)
+    return refit(train, [fit.point for fit in best], origins=best)
+
+
+def _starts(now: Round) -> tuple[list[Point], list[Fit | None]]:
+    """Return where to begin, and points near there whose derivatives are known."""
+    base, seen = now.base, now.seen
+    additions = [*singles(seen), *pairs(seen), *groups(seen)]
+    thin = base.thinned(now.every)
+    starts = [Point(base.point.z, {**base.point.strengths, **on}) for on in additions]
+    origins = [now.coarse.origin(thin, list(on)) for on in additions]
+    if base.units or len(base.point.z) == 1 or not _bent(base):
+        return starts, origins
+    middle = refit(now.thin, [Point(np.zeros_like(base.point.z))], iterations=0)[0]
+    for unit, strength in (next(iter(on.items())) for on in additions if len(on) == 1):
+        typical = float(np.sign(strength) * _TYPICAL * unit.high)
+        starts.append(Point(middle.point.z, {unit: typical}))
+        origins.append(middle.beside(unit))
+    return starts, origins
+
+
+def _bent(fit: Fit) -> bool:
+    """Return whether so much is left that derivatives mislead, and few segments say enough."""
+    return bool((fit.innovations**2).mean() > _BENT)
+
+
+def _promise(fit: Fit) -> float:
+    """Return the misfit that one more step would leave if the derivatives held."""
+    size = len(fit.point.z)
+    target = np.r_[fit.innovations.ravel(), fit.point.z]
+    prior = np.eye(size, fit.jacobian.shape[1])
+    step = np.linalg.lstsq(np.r_[fit.jacobian, prior], -target, rcond=None)[0]
+    left = fit.innovations.ravel() + fit.jacobian @ step
+    return min(float(left @ left), fit.misfit) + 4.0 * len(fit.units)
+
+
+def _fittest(fits: Sequence[Fit], most: int) -> list[Fit]:
+    """Return the best fits, of every set of effects two at most."""
+    kept: list[Fit] = []
+    names: list[frozenset[str]] = []
+    for fit in sorted(fits, key=lambda f: f.misfit + 4.0 * len(f.units)):
+        name = frozenset(u.name for u in fit.units)
+        if names.count(name) < 2 and not any(set(fit.units) == set(f.units) for f in kept):
+            kept.append(fit)
+            names.append(name)
+        if len(kept) == most:
+            break
+    return kept
