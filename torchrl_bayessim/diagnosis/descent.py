@@ -57,7 +57,7 @@ class Descent:
         self._asked: list[Array] = []
         self._origin = origin
         self._stage = "begin"
-        self._fresh = self.done = False
+        self._fresh = self._settled = self.done = False
         self.cost = np.inf
 
     def ask(self) -> list[Array]:
@@ -123,19 +123,23 @@ class Descent:
         self._learn(moved, change)
         if gain <= 1e-3 + 1e-4 * self.cost:
             self._settle()
+        else:
+            self._settled = False
 
     def _failed(self) -> None:
-        if not self._fresh and self._renew:
+        if self._settled:
+            self.done = True
+        elif self._renew and not self._fresh:
             self._stage = "renew"
-            return
-        self._damping *= _CAREFUL[-1] if len(self._factors) > 1 else 1.0
-        self._factors = _CAREFUL
-        self.done = self._damping > _STUCK
+        else:
+            self._damping *= _CAREFUL[-1] if len(self._factors) > 1 else 1.0
+            self._factors = _CAREFUL
+            self.done = self._damping > _STUCK
 
     def _settle(self) -> None:
-        """Stop, or make sure of the derivatives first."""
-        if self._renew and not self._fresh:
-            self._stage = "renew"
+        """Make sure of the derivatives, once, before it stops."""
+        if self._renew and not self._fresh and not self._settled:
+            self._stage, self._settled = "renew", True
         else:
             self.done = True
 
