@@ -1,3 +1,4 @@
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -10,6 +11,7 @@ from torchrl_bayessim.effects.effect import ActionEffect, ForceEffect, ModelEffe
 from torchrl_bayessim.effects.robot import Robot
 from torchrl_bayessim.effects.sequence import command_sequence, measured_sequence
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.errors import PhysicsError
 from torchrl_bayessim.physics.attributes import AttributePhysics
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
@@ -386,3 +388,32 @@ def test_attribute_physics_and_action_effects_go_together():
     env = TransformedEnv(GymEnv("Pendulum-v1"), chain)
     assert env.rollout(3)["theta"].shape == (3, 1)
     assert "action_lag" in repr(env.transform)
+
+
+SERVO = """
+<mujoco><option timestep="0.002" gravity="0 0 0"/>
+  <worldbody><body><joint name="hinge" axis="0 1 0" damping="1"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".03" mass="0.1"/></body></worldbody>
+  <actuator><position name="servo" joint="hinge" kp="5" ctrlrange="-1 1" ctrllimited="true"/>
+  </actuator></mujoco>
+"""
+
+
+@pytest.mark.parametrize(("target", "rest"), [(0.04, 0.0), (0.3, 0.25), (-0.3, -0.25)])
+def test_a_servo_rests_at_the_edge_of_its_dead_band(target, rest):
+    task = Task(
+        model=mujoco.MjModel.from_xml_string(SERVO),
+        frame_skip=10,
+        observation=lambda now: now.qpos,
+    )
+    env = TransformedEnv(BatchedMujocoEnv(task, 1, threads=1), ApplyEffect("dead_band", 0.05))
+    env.reset()
+    seen = run(env, torch.full((300, 1), target))
+    assert env.transform.effect.channel == "actuation"
+    assert seen[0, -1].item() == pytest.approx(rest, abs=1e-3)
+
+
+def test_the_dead_band_of_a_motor_is_around_no_command():
+    band = ApplyEffect("dead_band", 0.05)
+    TransformedEnv(GymEnv(NAME), band)
+    assert isinstance(band.effect, ActionEffect)

@@ -79,7 +79,7 @@ def units_of(effects: Sequence[Effect], robot: Robot) -> list[Unit]:
     At all together strengths are in proportion to their bounds.
     """
     units = []
-    for effect in effects:
+    for effect in (one.on(robot) for one in effects):
         names = effect.targets(robot)
         if not names:
             continue

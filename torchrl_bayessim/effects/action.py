@@ -22,10 +22,11 @@ __all__ = [
 import torch
 from torch import Tensor
 
-from .effect import ActionEffect, Memory, Now
+from .effect import ActionEffect, Effect, Memory, Now
 from .history import delayed, empty_line, filled, read_line
 from .laws import decay, quantized, within
 from .robot import Robot
+from .transmission import ServoDeadBand, servos
 
 _LONGEST = 8  # control steps that a delay line remembers
 
@@ -113,10 +114,15 @@ class ActionLag(ActionEffect):
 class DeadBand(ActionEffect):
     """Small commands do nothing and all lose ``s``: ``sgn(u) max(|u| − s, 0)``.
 
-    In units of the command, 0 to 40 % of ``u_max``.
+    In units of the command, 0 to 40 % of ``u_max``. A servo's band is around its target; see
+    `ServoDeadBand`.
     """
 
     name, unit, group, memoryless = "dead_band", "command", "dead zone", True
+
+    def on(self, robot: Robot) -> Effect:
+        """Return the band of servos, where there is one."""
+        return ServoDeadBand() if servos(robot) else self
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.4 ``u_max``."""

@@ -91,6 +91,11 @@ class Effect(ABC):
         options = ", ".join(f"{name}={value!r}" for name, value in vars(self).items())
         return f"{type(self).__name__}({options})"
 
+    def on(self, robot: Robot) -> Effect:
+        """Return the law that this effect is on this robot: itself, unless actuators matter."""
+        del robot
+        return self
+
     @abstractmethod
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the names of what it can act on, empty where it does not apply."""

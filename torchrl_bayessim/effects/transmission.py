@@ -7,7 +7,14 @@ and for servos alike. Strengths are per actuator.
 
 from __future__ import annotations
 
-__all__ = ["Backlash", "SeriesElasticity", "TorqueSpeedLimit", "driven"]
+__all__ = [
+    "Backlash",
+    "SeriesElasticity",
+    "ServoDeadBand",
+    "TorqueSpeedLimit",
+    "driven",
+    "servos",
+]
 
 import math
 from collections.abc import Mapping
@@ -37,6 +44,12 @@ def driven(robot: Robot) -> list[int]:
         and model.actuator_biastype[i] in (0, 1)  # mjBIAS_NONE, mjBIAS_AFFINE
         and model.actuator_gainprm[i, 0] != 0
     ]
+
+
+def servos(robot: Robot) -> list[int]:
+    """Return the actuators whose force grows with the distance from a commanded position."""
+    model = robot.model
+    return [] if model is None else [i for i in driven(robot) if model.actuator_biasprm[i, 1] != 0]
 
 
 class _Transmission(ForceEffect):
@@ -103,6 +116,29 @@ class TorqueSpeedLimit(_Transmission):
         limited = now.actuator_force.clamp(-share * largest, share * largest)
         drives = (share < 1) & (now.actuator_force * speed > 0)
         return _change(torch.where(drives, limited, now.actuator_force), now), memory
+
+
+class ServoDeadBand(_Transmission):
+    """A servo does nothing within ``s`` of its target, and elsewhere acts as if that much nearer.
+
+    ``e' = sgn(e) max(|e| − s, 0)`` for the error ``e = F / g``, the force per unit of command: of a
+    position servo the distance from its target, less what its damping adds; of a motor the command,
+    as in `DeadBand`. In units of the command, up to 0.1 (6°).
+    """
+
+    name, unit, group = "dead_band", "command", "dead zone"
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and a tenth of a unit or of ``u_max``."""
+        wide = 0.1 * robot.command_scale.clamp(max=1.0)
+        return torch.zeros_like(wide), wide
+
+    def forces(
+        self, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Mapping[str, Tensor], Memory]:
+        """Return the change of commands."""
+        error = now.actuator_force / now.actuator_gain
+        return {"command": -error.clamp(-strength, strength)}, memory
 
 
 class Backlash(_Transmission):

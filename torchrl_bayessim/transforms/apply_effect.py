@@ -136,13 +136,10 @@ class ApplyEffect(Transform):
         if self.parent is None:  # in a Compose that has no environment yet
             return
         env = simulator(self.parent)
-        onto_simulator = isinstance(self.effect, ForceEffect | ModelEffect)
-        if onto_simulator and isinstance(env, SerialEnv | ParallelEnv):
-            name = self.effect.name
-            hint = "put it inside the function that makes each environment"
-            got = f"{name} around a {type(env).__name__}"
-            raise TypeError(message(f"{name} beside each simulator", got, hint=hint))
+        self._refuse_several(env)
         self.know(env, self.parent)
+        self.effect = self.effect.on(self.robot)
+        self._refuse_several(env)
         self.strength = self._shared["strength"]
         self._steps = torch.zeros(*env.batch_size, 1, dtype=torch.float64)
         if self.key is None:
@@ -160,6 +157,15 @@ class ApplyEffect(Transform):
             models = models_of(env)
             acting.setdefault(identity, Overlay(models))
         self._acting = acting.get(identity)
+
+    def _refuse_several(self, env: EnvBase) -> None:
+        """Raise where an effect on a simulator would be put around several of them."""
+        onto_simulator = isinstance(self.effect, ForceEffect | ModelEffect)
+        if onto_simulator and isinstance(env, SerialEnv | ParallelEnv):
+            name = self.effect.name
+            hint = "put it inside the function that makes each environment"
+            got = f"{name} around a {type(env).__name__}"
+            raise TypeError(message(f"{name} beside each simulator", got, hint=hint))
 
     def know(self, env: EnvBase, outside: EnvBase | None = None) -> None:
         """Learn from a simulator what there is to act on, where no robot was given.
