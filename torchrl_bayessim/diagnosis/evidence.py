@@ -68,7 +68,7 @@ def assemble(
         for p in parameters if p.at_bound
     ]  # fmt: skip
     rollouts = rollout_errors(
-        prepared, {"refit": nominal.fit.point, "with_effects": best.fit.point}
+        prepared, {"raw": zero, "refit": nominal.fit.point, "with_effects": best.fit.point}
     )
     candidates = _candidates(selection, confused, alpha)
     effects = _effects(selection, credit, measured, system.robot)

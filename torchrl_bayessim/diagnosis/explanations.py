@@ -7,7 +7,7 @@ the best of those to the end (successive halving, Jamieson & Talwalkar 2016).
 
 from __future__ import annotations
 
-__all__ = ["Round", "compare", "explanations"]
+__all__ = ["Round", "bent", "compare", "explanations"]
 
 from collections import Counter
 from collections.abc import Sequence
@@ -25,7 +25,8 @@ _SURVIVORS, _FINALISTS = 7, 4  # that are fitted on all segments, and to the end
 _MANY, _APART, _MATTER = 150, 4, 8  # units, targets of one effect, effects to look at singly
 _FEW, _EVERY = 8, 4  # segments on which a round begins at least, and which share at least
 _BENT = 5.0  # mean squared innovation of a nominal fit that may have gone astray
-_TYPICAL = 0.2  # of an effect's range, to start from
+_PLAIN = 100.0  # and of one that leaves a gap which a few segments show
+_TYPICAL = (0.05, 0.2)  # of an effect's range, to start from
 _NEAR = 0.3  # prior standard deviations within which derivatives may hold
 
 
@@ -67,7 +68,7 @@ def compare(train: Objective, base: Fit, units: Sequence[Unit], *, glance: bool 
         names = list(dict.fromkeys(unit.name for unit in order))[:_MATTER]
         units = [u for u in units if u in whole or u.name in names]
     coarse = screen(thin, fit, units)
-    if glance or every == 1 or _bent(base):
+    if glance or every == 1 or _plain(base):
         return Round(base, coarse.grown(every), thin, coarse, every)
     best = coarse.best(1.0)
     first = sorted(best, key=lambda unit: -best[unit][0])[:_MATTER]
@@ -80,16 +81,17 @@ def compare(train: Objective, base: Fit, units: Sequence[Unit], *, glance: bool 
 def explanations(train: Objective, now: Round) -> list[Fit]:
     """Fit what may be added to the base: first many for a few steps, then the best on.
 
-    Where the gap is large the screen's linear view from a bent nominal fit can mislead. So every
-    effect gets a try, from there and from the prior's centre, before most are dropped.
+    Where the gap is large the screen's linear view from a bent nominal fit can mislead: a damping
+    that has absorbed dry friction leaves nothing for friction to explain. So every effect gets a
+    try, from there and from the prior's centre, before most are dropped.
     """
     base = now.base
     starts, origins = _starts(now)
     tried = refit(now.thin, starts, origins=origins, iterations=0, renew=False)
     tried = sorted(tried, key=_promise)[:_PROMISING]
     starts = [fit.point for fit in tried]
-    tried = refit(now.thin, starts, origins=tried, iterations=4 if _bent(base) else 2, renew=False)
-    if _bent(base):  # a few segments say enough
+    tried = refit(now.thin, starts, origins=tried, iterations=3, renew=False)
+    if _plain(base):
         return refit(train, [fit.point for fit in _fittest(tried, _FINALISTS)])
     starts = [fit.point for fit in _fittest(tried, _SURVIVORS)]
     known: list[Fit | None] = []
@@ -109,19 +111,33 @@ def _starts(now: Round) -> tuple[list[Point], list[Fit | None]]:
     thin = base.thinned(now.every)
     starts = [Point(base.point.z, {**base.point.strengths, **on}) for on in additions]
     origins = [now.coarse.origin(thin, list(on)) for on in additions]
-    if base.units or len(base.point.z) == 1 or not _bent(base):
+    if base.units or len(base.point.z) == 1 or not bent(base):
         return starts, origins
     middle = refit(now.thin, [Point(np.zeros_like(base.point.z))], iterations=0)[0]
-    for unit, strength in (next(iter(on.items())) for on in additions if len(on) == 1):
-        typical = float(np.sign(strength) * _TYPICAL * unit.high)
-        starts.append(Point(middle.point.z, {unit: typical}))
-        origins.append(middle.beside(unit))
+    for unit, sign in _everything(seen).items():
+        for typical in _TYPICAL:
+            starts.append(Point(middle.point.z, {unit: sign * typical * unit.high}))
+            origins.append(middle.beside(unit))
     return starts, origins
 
 
-def _bent(fit: Fit) -> bool:
-    """Return whether so much is left that derivatives mislead, and few segments say enough."""
+def _everything(seen: Screen) -> dict[Unit, float]:
+    """Return each effect at its best place and at all of its targets, and the better sign."""
+    best = seen.best(1.0)
+    chosen: dict[tuple[str, bool], Unit] = {}
+    for unit in sorted(best, key=lambda unit: -best[unit][0]):
+        chosen.setdefault((unit.name, unit.where == "all"), unit)
+    return {unit: float(np.sign(best[unit][1])) or 1.0 for unit in chosen.values()}
+
+
+def bent(fit: Fit) -> bool:
+    """Return whether so much is left that derivatives may mislead."""
     return bool((fit.innovations**2).mean() > _BENT)
+
+
+def _plain(fit: Fit) -> bool:
+    """Return whether so much is left that a few segments say enough."""
+    return bool((fit.innovations**2).mean() > _PLAIN)
 
 
 def _promise(fit: Fit) -> float:
@@ -131,18 +147,32 @@ def _promise(fit: Fit) -> float:
     prior = np.eye(size, fit.jacobian.shape[1])
     step = np.linalg.lstsq(np.r_[fit.jacobian, prior], -target, rcond=None)[0]
     left = fit.innovations.ravel() + fit.jacobian @ step
-    return min(float(left @ left), fit.misfit) + 4.0 * len(fit.units)
+    return _priced(fit, min(float(left @ left), fit.misfit))
+
+
+def _priced(fit: Fit, misfit: float) -> float:
+    """Return a misfit that is larger the more strengths it took, by what chance would gain."""
+    return misfit * (1 + 4.0 * len(fit.units) / fit.innovations.size) + 4.0 * len(fit.units)
 
 
 def _fittest(fits: Sequence[Fit], most: int) -> list[Fit]:
-    """Return the best fits, of every set of effects two at most."""
+    """Return the best fits, of every set of effects two at most; half of them of the fewest."""
+    order = sorted(fits, key=lambda f: _priced(f, f.misfit))
+    fewest = min(len(_names(fit)) for fit in fits)
+    half = _apart([fit for fit in order if len(_names(fit)) == fewest], most // 2)
+    chosen = _apart([*half, *(fit for fit in order if fit not in half)], most)
+    return sorted(chosen, key=order.index)
+
+
+def _apart(fits: Sequence[Fit], most: int) -> list[Fit]:
+    """Return the first fits, of every set of units one and of every set of effects two at most."""
     kept: list[Fit] = []
-    names: list[frozenset[str]] = []
-    for fit in sorted(fits, key=lambda f: f.misfit + 4.0 * len(f.units)):
-        name = frozenset(u.name for u in fit.units)
-        if names.count(name) < 2 and not any(set(fit.units) == set(f.units) for f in kept):
+    for fit in fits:
+        alike = sum(_names(fit) == _names(other) for other in kept)
+        if len(kept) < most and alike < 2 and all(set(fit.units) != set(f.units) for f in kept):
             kept.append(fit)
-            names.append(name)
-        if len(kept) == most:
-            break
     return kept
+
+
+def _names(fit: Fit) -> frozenset[str]:
+    return frozenset(unit.name for unit in fit.units)

@@ -67,16 +67,16 @@ def size(report: Report) -> Markup:
 
 def _rollouts(report: Report) -> Markup | None:
     errors = report.gap.rollout_rmse
-    before, after = errors.get("refit", {}), errors.get("with_effects", {})
+    raw, before, after = (errors.get(n, {}) for n in ("raw", "refit", "with_effects"))
     if not before:
         return None
-    head = ["output", "parameters fitted", "with effects", "ratio"]
+    head = ["output", "as described", "parameters fitted", "with effects", "ratio"]
     rows = [
-        [name, number(error), number(after.get(name)), ratio(error, after.get(name))]
-        for name, error in before.items()
+        [name, number(raw.get(name)), *map(number, pair), ratio(*pair)]
+        for name, pair in ((n, (error, after.get(n))) for n, error in before.items())
     ]
     if not report.effects:
-        head, rows = head[:2], [row[:2] for row in rows]
+        head, rows = head[:3], [row[:3] for row in rows]
     return table("Open-loop error over whole test runs, root mean square, SI units", head, rows)
 
 

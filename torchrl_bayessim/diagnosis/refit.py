@@ -55,6 +55,15 @@ class Fit:
         jacobian = np.c_[self.jacobian, np.zeros(len(self.jacobian))]
         return Fit(point, (*self.units, unit), self.innovations, jacobian)
 
+    def without(self, unit: Unit) -> Fit:
+        """Return the fit with a unit at zero and no longer free, by its derivatives."""
+        column = len(self.point.z) + self.units.index(unit)
+        strengths = {u: s for u, s in self.point.strengths.items() if u != unit}
+        change = self.jacobian[:, column] * self.point.strengths[unit] / unit.high
+        left = self.innovations - change.reshape(self.innovations.shape)
+        jacobian = np.delete(self.jacobian, column, axis=1)
+        return Fit(Point(self.point.z, strengths), tuple(strengths), left, jacobian)
+
     def covariance(self, dispersion: float) -> Array:
         """Return the covariance of standardised parameters and relative strengths.
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..effects.effect import ForceEffect
-from .explanations import compare, explanations
+from .explanations import bent, compare, explanations
 from .objective import Objective, Point, Unit
 from .refit import Fit, refit
 from .screening import Screen
@@ -31,6 +31,7 @@ _REST = 0.5  # of what the base leaves: what any further effect must remove
 _REMAINS = 0.01  # of the gap: not worth another effect
 _WRONG = 1.5  # mean squared innovation of a base that something is missing from
 _MOST = 4  # effects in one explanation
+_APART = 3  # effects without each of which a model is fitted with derivatives of its own
 _RIVALS = 6  # models with another effect in the place of one
 
 
@@ -111,7 +112,8 @@ def select(
         now = compare(train, best.fit, left, glance=enough)
         screens.append(now.seen)
         p_values.append(_p_value(now.seen, best, generator))
-        if p_values[-1] > alpha or enough:
+        # where much is left, what a first derivative does not see may still be the cause
+        if enough or (p_values[-1] > alpha and not bent(best.fit)):
             break
         progress("fitting explanations")
         models = _judged(validation, explanations(train, now))
@@ -252,13 +254,9 @@ def _eliminated(train: Objective, validation: Objective, model: Model) -> tuple[
     """Take out, one at a time, units without which the data are explained as well."""
     tried: list[Model] = []
     while model.units:
-        without = [
-            Point(
-                model.fit.point.z, {u: s for u, s in model.fit.point.strengths.items() if u != out}
-            )
-            for out in model.units
-        ]
-        fits = refit(train, without)
+        without = [model.fit.without(unit) for unit in model.units]
+        few = len(without) <= _APART
+        fits = refit(train, [fit.point for fit in without], origins=without, renew=few)
         judged = validation([fit.point for fit in fits])
         smaller = [Model(f, v) for f, v in zip(fits, judged, strict=True)]
         tried += smaller
@@ -270,7 +268,8 @@ def _eliminated(train: Objective, validation: Objective, model: Model) -> tuple[
         ):
             break
         model = smaller[best]
-    return model, tried
+    there = refit(train, [model.fit.point], iterations=0)[0]
+    return Model(there, model.validation), tried
 
 
 def _alternatives(

@@ -5,9 +5,9 @@ how much of it the effects explain, not only whether it is significant::
 
     none           nothing significant, or an excess below 5 % of the noise floor
     named          effects explain at least 80 %, and what is left is not significant, or 2 %
-    named_partial  effects explain at least half; the rest is located
+    named_partial  effects explain at least 40 %; the rest is located
     ambiguous      effects of different kinds explain the data equally well
-    unknown        the gap is real, and the catalogue does not explain half of it
+    unknown        the gap is real, and the catalogue does not explain 40 % of it
     not_testable   the data are too few or too uniform to say
 """
 
@@ -28,7 +28,7 @@ from .shrinkage import Shrinkage
 
 _NEGLIGIBLE = 0.05  # of the noise floor: an excess that no one would chase
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
-_ALL, _NAMED, _PARTIAL = 0.98, 0.8, 0.5
+_ALL, _NAMED, _PARTIAL = 0.98, 0.8, 0.4
 
 
 def conclude(
