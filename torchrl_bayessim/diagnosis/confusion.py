@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-__all__ = ["confusion_set"]
+__all__ = ["confusion_set", "rivals", "settled"]
 
-from .selection import Selection, as_good
+from dataclasses import replace
+
+from .objective import Objective
+from .selection import Model, Selection, as_good
 
 
 def confusion_set(selection: Selection, name: str) -> tuple[str, ...]:
@@ -18,10 +21,28 @@ def confusion_set(selection: Selection, name: str) -> tuple[str, ...]:
 
     The first name is the effect's own.
     """
-    best = selection.best
+    own = {unit.name for unit in selection.best.units}
     names = [name]
-    for rival in selection.alternatives.get(name, ()):
-        new = [u.name for u in rival.units if u.name not in {v.name for v in best.units}]
-        if as_good(best, rival):
-            names += [other for other in dict.fromkeys(new) if other not in names]
+    for rival in rivals(selection, name):
+        new = [u.name for u in rival.units if u.name not in own]
+        names += [other for other in dict.fromkeys(new) if other not in names]
     return tuple(names)
+
+
+def rivals(selection: Selection, name: str) -> list[Model]:
+    """Return the models with another effect in the place of one that are as good as the best."""
+    return [m for m in selection.alternatives.get(name, ()) if as_good(selection.best, m)]
+
+
+def settled(selection: Selection, name: str, test: Objective) -> Selection:
+    """Return the selection with that one of equals in front that explains the test runs best."""
+    equals = [selection.best, *rivals(selection, name)]
+    left = [float((one**2).sum()) for one in test([model.fit.point for model in equals])]
+    first = equals[left.index(min(left))]
+    if first is selection.best:
+        return selection
+    own = {unit.name for unit in selection.best.units}
+    new = next(u.name for u in first.units if u.name not in own)
+    others = tuple(m for m in (selection.best, *selection.alternatives[name]) if m is not first)
+    kept = {n: models for n, models in selection.alternatives.items() if n != name}
+    return replace(selection, best=first, alternatives={**kept, new: others})

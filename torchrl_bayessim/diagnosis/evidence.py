@@ -16,7 +16,7 @@ from ..effects.robot import Robot
 from ..effects.units import unit_at
 from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
-from .confusion import confusion_set
+from .confusion import confusion_set, settled
 from .divergence import divergence_alarms
 from .figures import figures
 from .location import location
@@ -54,9 +54,12 @@ def assemble(
         begun: When the diagnosis began, by ``time.perf_counter``.
         alpha: Level of the tests.
     """
+    test = prepared.sets["test"]
+    credit = _credit(selection)
+    if credit:
+        selection = settled(selection, max(credit, key=credit.__getitem__), test)
     best, nominal = selection.best, selection.nominal
     zero = Point(np.zeros_like(nominal.fit.point.z))
-    test = prepared.sets["test"]
     measured = shrinkage(test, [zero, nominal.fit.point, best.fit.point], generator)
     credit = _credit(selection)
     confused = confusion_set(selection, max(credit, key=credit.__getitem__)) if credit else ()

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..effects.robot import Robot
 from .additions import groups, pairs, singles
-from .objective import Objective, Point, Unit
+from .objective import Objective, Point, Unit, units_of
 from .refit import Fit, refit
 from .screening import Screen, screen
 
@@ -83,16 +84,24 @@ def explanations(train: Objective, now: Round) -> list[Fit]:
 
     Where the gap is large the screen's linear view from a bent nominal fit can mislead: a damping
     that has absorbed dry friction leaves nothing for friction to explain. So every effect gets a
-    try, from there and from the prior's centre, before most are dropped.
+    try: from there, from the prior's centre, and with the parameters moved to make room for it.
     """
     base = now.base
     starts, origins = _starts(now)
+    if not starts:
+        return []
     tried = refit(now.thin, starts, origins=origins, iterations=0, renew=False)
     tried = sorted(tried, key=_promise)[:_PROMISING]
     starts = [fit.point for fit in tried]
     tried = refit(now.thin, starts, origins=tried, iterations=3, renew=False)
+    everywhere = [
+        point
+        for fit in _fittest(tried, _SURVIVORS)
+        for point in _spread(fit, train.predictor.system.robot)
+    ]
+    tried += refit(now.thin, everywhere, iterations=3, renew=False)
     if _plain(base):
-        return refit(train, [fit.point for fit in _fittest(tried, _FINALISTS)])
+        return refit(train, [fit.point for fit in _fittest(tried, _FINALISTS, alike=1)])
     starts = [fit.point for fit in _fittest(tried, _SURVIVORS)]
     known: list[Fit | None] = []
     for point in starts:
@@ -100,7 +109,7 @@ def explanations(train: Objective, now: Round) -> list[Fit]:
         near = np.abs(point.z - base.point.z).max() < _NEAR
         known.append(now.seen.origin(base, on) if near else None)
     tried = refit(train, starts, origins=known, iterations=2, renew=False)
-    best = _fittest(tried, _FINALISTS)
+    best = _fittest(tried, _FINALISTS, alike=1)
     return refit(train, [fit.point for fit in best], origins=best)
 
 
@@ -115,10 +124,36 @@ def _starts(now: Round) -> tuple[list[Point], list[Fit | None]]:
         return starts, origins
     middle = refit(now.thin, [Point(np.zeros_like(base.point.z))], iterations=0)[0]
     for unit, sign in _everything(seen).items():
-        for typical in _TYPICAL:
-            starts.append(Point(middle.point.z, {unit: sign * typical * unit.high}))
-            origins.append(middle.beside(unit))
+        starts.append(Point(middle.point.z, {unit: sign * _TYPICAL[-1] * unit.high}))
+        origins.append(middle.beside(unit))
+        known = now.coarse.origin(thin, [unit])
+        if known is not None:
+            starts += [_exchanged(known, unit, sign * typical * unit.high) for typical in _TYPICAL]
+            origins += [known] * len(_TYPICAL)
     return starts, origins
+
+
+def _exchanged(known: Fit, unit: Unit, strength: float) -> Point:
+    """Return the unit at a strength, and the parameters without what they did in its place."""
+    size = len(known.point.z)
+    derivative = np.r_[known.jacobian[:, :size], np.eye(size)]
+    effect = np.r_[known.jacobian[:, -1] * strength / unit.high, np.zeros(size)]
+    instead = np.linalg.lstsq(derivative, effect, rcond=None)[0]
+    edge = np.sqrt(3.0)  # of a uniform prior; a fit starts within its bounds anyway
+    return Point(np.clip(known.point.z - instead, -edge, edge), {unit: strength})
+
+
+def _spread(fit: Fit, robot: Robot) -> list[Point]:
+    """Return the point where what acts at all targets alike may act at each as it will."""
+    strengths: dict[Unit, float] = {}
+    for unit, strength in fit.point.strengths.items():
+        parts = [unit]
+        if sum(part != 0 for part in unit.direction) > 1:
+            parts = [one for one in units_of([unit.effect], robot) if one.where != "all"]
+        for part in parts:
+            share = float(np.dot(part.direction, unit.direction)) if part != unit else 1.0
+            strengths[part] = strengths.get(part, 0.0) + share * strength
+    return [] if set(strengths) == set(fit.units) else [Point(fit.point.z, strengths)]
 
 
 def _everything(seen: Screen) -> dict[Unit, float]:
@@ -155,21 +190,21 @@ def _priced(fit: Fit, misfit: float) -> float:
     return misfit * (1 + 4.0 * len(fit.units) / fit.innovations.size) + 4.0 * len(fit.units)
 
 
-def _fittest(fits: Sequence[Fit], most: int) -> list[Fit]:
-    """Return the best fits, of every set of effects two at most; half of them of the fewest."""
+def _fittest(fits: Sequence[Fit], most: int, alike: int = 2) -> list[Fit]:
+    """Return the best fits, so many of every set of effects at most; half of them of the fewest."""
     order = sorted(fits, key=lambda f: _priced(f, f.misfit))
     fewest = min(len(_names(fit)) for fit in fits)
-    half = _apart([fit for fit in order if len(_names(fit)) == fewest], most // 2)
-    chosen = _apart([*half, *(fit for fit in order if fit not in half)], most)
+    half = _apart([fit for fit in order if len(_names(fit)) == fewest], most // 2, alike)
+    chosen = _apart([*half, *(fit for fit in order if fit not in half)], most, alike)
     return sorted(chosen, key=order.index)
 
 
-def _apart(fits: Sequence[Fit], most: int) -> list[Fit]:
-    """Return the first fits, of every set of units one and of every set of effects two at most."""
+def _apart(fits: Sequence[Fit], most: int, alike: int) -> list[Fit]:
+    """Return the first fits, of every set of units one and of every set of effects so many."""
     kept: list[Fit] = []
     for fit in fits:
-        alike = sum(_names(fit) == _names(other) for other in kept)
-        if len(kept) < most and alike < 2 and all(set(fit.units) != set(f.units) for f in kept):
+        same = sum(_names(fit) == _names(other) for other in kept)
+        if len(kept) < most and same < alike and all(set(fit.units) != set(f.units) for f in kept):
             kept.append(fit)
     return kept
 

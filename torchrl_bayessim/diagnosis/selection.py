@@ -12,7 +12,7 @@ from __future__ import annotations
 __all__ = ["Model", "Selection", "as_good", "select"]
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,10 +42,12 @@ class Model:
     Attributes:
         fit: On the training segments.
         validation: Weighted innovations on the validation segments, ``(S, KC)``.
+        logs: Which log each segment is from, training then validation.
     """
 
     fit: Fit
     validation: Array
+    logs: NDArray[np.int64]
 
     @property
     def units(self) -> tuple[Unit, ...]:
@@ -103,7 +105,7 @@ def select(
         generator: Of the null distribution's draws.
         progress: Told what is done.
     """
-    start = Model(nominal, validation([nominal.point])[0])
+    start = _judged(train, validation, [nominal])[0]
     best, tried, screens, p_values = start, [start], [], []
     for round_number in range(_MOST):
         progress(f"screening {len(units)} effects, round {round_number + 1}")
@@ -116,7 +118,7 @@ def select(
         if enough or (p_values[-1] > alpha and not bent(best.fit)):
             break
         progress("fitting explanations")
-        models = _judged(validation, explanations(train, now))
+        models = _judged(train, validation, explanations(train, now))
         tried += models
         better = _needed_only(start, best, _chosen(best, models), models)
         if better is None or not _identified(start, best, better, models):
@@ -151,7 +153,7 @@ def _exactly(train: Objective, validation: Objective, model: Model) -> Model:
     if not forced or train.predictor.exact:
         return model
     train.predictor.exact = validation.predictor.exact = True
-    return _judged(validation, refit(train, [model.fit.point], iterations=4))[0]
+    return _judged(train, validation, refit(train, [model.fit.point], iterations=4))[0]
 
 
 def _p_value(seen: Screen, model: Model, generator: np.random.Generator) -> float:
@@ -174,12 +176,14 @@ def _fitted(
 ) -> list[Model]:
     """Fit the base model with each addition."""
     starts = [Point(base.fit.point.z, {**base.fit.point.strengths, **more}) for more in additions]
-    return _judged(validation, refit(train, starts)) if starts else []
+    return _judged(train, validation, refit(train, starts)) if starts else []
 
 
-def _judged(validation: Objective, fits: Sequence[Fit]) -> list[Model]:
+def _judged(train: Objective, validation: Objective, fits: Sequence[Fit]) -> list[Model]:
     judged = validation([fit.point for fit in fits]) if fits else []
-    return [Model(fit, innovations) for fit, innovations in zip(fits, judged, strict=True)]
+    first = 1 + int(train.segments.log.max())
+    logs = np.r_[train.segments.log, first + validation.segments.log]
+    return [Model(fit, innovations, logs) for fit, innovations in zip(fits, judged, strict=True)]
 
 
 def _criterion(model: Model, dispersion: float) -> float:
@@ -257,8 +261,7 @@ def _eliminated(train: Objective, validation: Objective, model: Model) -> tuple[
         without = [model.fit.without(unit) for unit in model.units]
         few = len(without) <= _APART
         fits = refit(train, [fit.point for fit in without], origins=without, renew=few)
-        judged = validation([fit.point for fit in fits])
-        smaller = [Model(f, v) for f, v in zip(fits, judged, strict=True)]
+        smaller = _judged(train, validation, fits)
         tried += smaller
         criterion = [_criterion(m, model.dispersion()) for m in smaller]
         best = int(np.argmin(criterion))
@@ -269,7 +272,7 @@ def _eliminated(train: Objective, validation: Objective, model: Model) -> tuple[
             break
         model = smaller[best]
     there = refit(train, [model.fit.point], iterations=0)[0]
-    return Model(there, model.validation), tried
+    return replace(model, fit=there), tried
 
 
 def _alternatives(
@@ -288,7 +291,7 @@ def _alternatives(
         known = [m for m in tried if _stands_in(m, kept, name)]
         if kept:
             fits = refit(train, [Point(best.fit.point.z, kept)])
-            base = _judged(validation, fits)[0]
+            base = _judged(train, validation, fits)[0]
             left = [u for u in units if u not in kept and u.name != name]
             strongest = compare(train, base.fit, left).seen.best(1.0)
             order = sorted(strongest, key=lambda unit: -strongest[unit][0])
@@ -312,10 +315,17 @@ def as_good(best: Model, rival: Model) -> bool:
     mine, others = best.deviances(), rival.deviances()
     if float((others - mine).sum()) / best.dispersion() < _LIKELY:
         return True
-    return max(_score(others - mine), _score(np.log(others / mine))) < _DEVIATIONS
+    kinds = others - mine, np.log(others / mine)
+    return max(_score(kind, best.logs) for kind in kinds) < _DEVIATIONS
 
 
-def _score(differences: NDArray[np.float64]) -> float:
-    """Return the mean in standard errors."""
-    error = float(differences.std(ddof=1)) / np.sqrt(len(differences))
-    return float(differences.mean()) / max(error, 1e-12)
+def _score(differences: Array, logs: NDArray[np.int64]) -> float:
+    """Return the mean in standard errors, of segments or of logs, whichever are larger.
+
+    What is wrong with both models is wrong all along a log, and speaks for the one in some logs and
+    for the other in others (clustered errors, Liang & Zeger 1986).
+    """
+    mean, count = float(differences.mean()), len(differences)
+    by_log = np.bincount(logs, differences - mean)
+    errors = float(((differences - mean) ** 2).sum()), float((by_log**2).sum())
+    return mean / max(np.sqrt(max(errors)) / count, 1e-12)
