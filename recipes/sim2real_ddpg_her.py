@@ -51,7 +51,7 @@ class Sim2RealFetch(recipe.Settings):
     truth: str = "nominal"  # or "random": drawn from the prior by the seed
     rounds: int = 2
     episodes: int = 4  # real episodes per round
-    simulations: int = 512  # pairs per round
+    simulations: int = 256  # pairs per round
     warmup: int = 0  # batches for the data-collecting policy; 0 for the task's own number
     updates: int = 0  # batches per round under the posterior; 0 for the task's own number
     algorithm: str = ""  # ddpg or td3; empty for the task's own
