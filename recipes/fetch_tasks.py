@@ -25,6 +25,8 @@ from torchrl_bayessim.physics.mujoco import MujocoPhysics
 from torchrl_bayessim.summaries import cross_correlation, linear_dynamics
 
 MEASURED = ("observation", "achieved_goal", "desired_goal")
+ARM = ("shoulder_pan", "shoulder_lift", "upperarm_roll", "elbow_flex", "wrist_flex", "wrist_roll")
+DAMPING = tuple(f"dof_damping[robot0:{joint}_joint]" for joint in ARM)  # nominally all 50
 FRICTION = ("geom_friction[body:table0,0]", "geom_friction[object0,0]")
 
 
@@ -130,7 +132,7 @@ FETCH: dict[str, GoalTask] = {
         "FetchReach-v4",
         prior=BoxPrior({"damping": (10.0, 200.0)}, units={"damping": "N m s/rad"}),
         truth={"damping": 50.0},
-        physics=lambda: MujocoPhysics(damping="dof_damping[robot0:shoulder_pan_joint]"),
+        physics=lambda: MujocoPhysics(damping=DAMPING),
         summaries=(gripper_dynamics,),
         warmup=8,
         updates=8,
