@@ -111,6 +111,18 @@ def test_dry_friction_is_named_and_measured():
     assert report.where["channel"]["body"] == 1.0
 
 
+def test_a_limit_that_was_never_reached_is_asked_for_with_larger_commands(monkeypatch):
+    strong = commands
+    monkeypatch.setitem(globals(), "commands", lambda *args: np.clip(0.6 * strong(*args), -2, 2))
+    report = diagnose(system(), None, logs(), effects=["saturation", "coulomb_friction"])
+    assert report.verdict == "none"
+    proposal = report.next_experiment[0]
+    assert proposal["separates"] == ["saturation", "nothing"]
+    assert "150 % of the recorded commands" in proposal["excitation"]
+    assert proposal["expected_odds"] > 100
+    assert 0 < proposal["seconds"] <= 30
+
+
 def test_the_frequency_of_a_disturbance_is_found():
     clock = iter(np.tile(0.0005 * np.arange(200 * 5 * FINER), 6))
 

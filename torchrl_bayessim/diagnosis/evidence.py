@@ -18,6 +18,7 @@ from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
 from .confusion import confusion_set, settled
 from .divergence import divergence_alarms
+from .experiment import experiments
 from .figures import figures
 from .location import location
 from .objective import Objective, Point, Unit, strengths_of
@@ -115,7 +116,9 @@ def assemble(
         candidates=candidates,
         parameters=parameters,
         alarms=(*alarms, *more),
-        next_experiment=(),
+        next_experiment=experiments(
+            prepared, selection, confused, _not_excited(selection, candidates), generator=generator
+        ),
         audit={
             **{name: list(names) for name, names in prepared.names.items()},
             "simulator_steps": prepared.predictor.steps,
@@ -128,6 +131,13 @@ def assemble(
         strengths=_by_target(best.fit.point, system.robot) if effects else {},
         figures=figures(prepared, selection, measured),
     )
+
+
+def _not_excited(selection: Selection, candidates: Sequence[Candidate]) -> list[Unit]:
+    """Return the units of effects that the data could have shown nowhere, at all targets first."""
+    excited = {c.name for c in candidates if c.status != "not_excited"}
+    units = dict.fromkeys(selection.screens[0].units)
+    return sorted((u for u in units if u.name not in excited), key=lambda u: u.where != "all")
 
 
 def _by_target(point: Point, robot: Robot) -> dict[Effect, dict[str, float]]:

@@ -135,11 +135,40 @@ class Predictor:
             parts.append(self._residuals(segments, theta[part], some, steps))
         return np.concatenate(parts)
 
+    def states(
+        self, segments: Segments, theta: Array, strengths: Strengths | None = None
+    ) -> tuple[Array, Array]:
+        """Return simulated positions and velocities, ``(P, S, H, nq)`` and ``(P, S, H, nv)``.
+
+        Args:
+            segments: What to replay.
+            theta: Parameters, shape ``(P, D)``.
+            strengths: Of the effects that are on somewhere.
+        """
+        strengths = {} if strengths is None else strengths
+        restored = self._restored(segments, strengths, len(theta))
+        simulated = self._simulate(segments, theta, strengths, restored=restored)
+        nq = self.system.task.model.nq
+        return simulated[..., :nq], simulated[..., nq : nq + self.tangent.size]
+
     def _residuals(
         self, segments: Segments, theta: Array, strengths: Strengths, offsets: Array | None
     ) -> Array:
+        restored = self._restored(segments, strengths, len(theta))
+        simulated = self._simulate(segments, theta, strengths, restored=restored, offsets=offsets)
+        return self._compare(segments, simulated, restored, strengths)
+
+    def _simulate(
+        self,
+        segments: Segments,
+        theta: Array,
+        strengths: Strengths,
+        *,
+        restored: Array | None,
+        offsets: Array | None = None,
+    ) -> Array:
+        """Return what follows from the start states, shape ``(P, S, H, outputs)``."""
         count, size, horizon = len(theta), len(segments), segments.horizon
-        restored = self._restored(segments, strengths, count)
         commands, sequence = self._commands(segments, strengths, count)
         self._write(theta, strengths)
         stepper, at = self._stepper, segments.history
@@ -179,8 +208,7 @@ class Predictor:
                 commands=commands[sequence[pushed]],
                 simulated=simulated,
             )
-        simulated = simulated.reshape(count, size, horizon, -1)
-        return self._compare(segments, simulated, restored, strengths)
+        return simulated.reshape(count, size, horizon, -1)
 
     def _push(
         self,

@@ -6,7 +6,7 @@ the validation logs too, and the test logs are opened once, for the figures that
 
 from __future__ import annotations
 
-__all__ = ["Prepared", "prepare", "split"]
+__all__ = ["Prepared", "cut_for_fits", "prepare", "split"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -139,7 +139,7 @@ def prepare(
         )
         horizon = min(horizon, shortest // 2)
     pieces = {
-        name: _cut(part, horizon, history=history, most=max(12, _ROWS[name] // horizon))
+        name: cut_for_fits(part, horizon, history=history, most=max(12, _ROWS[name] // horizon))
         for name, part in parts.items()
     }
     nominal, whitenings = _nominal(predictor, system, pieces, noise=noise, generator=generator)
@@ -147,7 +147,7 @@ def prepare(
     return Prepared(predictor, sets, parts, noise, source, horizon, nominal, tuple(alarms))
 
 
-def _cut(logs: Sequence[Log], horizon: int, *, history: int, most: int) -> Segments:
+def cut_for_fits(logs: Sequence[Log], horizon: int, *, history: int, most: int) -> Segments:
     """Cut logs into the segments that fits, screens and figures are made on."""
     return cut(
         logs,
@@ -232,7 +232,7 @@ def _horizon(
     for steps in _LADDER:
         if steps > typical / 5:
             break
-        pieces = _cut(logs, steps, history=history, most=max(4, _PROBE // steps))
+        pieces = cut_for_fits(logs, steps, history=history, most=max(4, _PROBE // steps))
         white = whitening(predictor, pieces, parameters_at(system.prior, z), noise)
         if white.curvature > 1.0 and np.isfinite(best):
             break

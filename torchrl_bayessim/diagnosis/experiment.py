@@ -1,0 +1,208 @@
+"""What to record next: the excitation that would best tell apart what these data cannot.
+
+For two explanations ``e`` and ``f``, an experiment is simulated under ``e``; what of it ``f`` could
+not explain, even with its parameters and strengths moved as far as the data so far allow, is::
+
+    D = min_x ‖ŷ_f − ŷ_e + J x‖² + ‖J₀ x‖²
+
+in units of the noise, ``J`` and ``J₀`` the derivatives of ``f`` in the experiment and in the
+training data (discrimination with nuisance parameters, Atkinson & Fedorov 1975). With the
+dispersion φ of what the best model leaves, one run brings expected log odds of ``D / 2φ``, and
+``4 (z₀.₉₅ + z₀.₉)² φ / D`` runs decide. Commands stay within the actuators' limits and motions near
+what was recorded.
+"""
+
+from __future__ import annotations
+
+__all__ = ["experiments"]
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..logs.log import Log
+from .confusion import rivals
+from .excitations import excitations
+from .objective import Objective, Point, Unit, strengths_of
+from .preparation import Prepared, cut_for_fits
+from .refit import Fit, refit
+from .segments import cut
+from .selection import Selection
+from .whitening import whitening
+
+Array = NDArray[np.float64]
+_SECONDS, _STEPS = 10.0, 400  # of one run, at most
+_AMPLITUDES = (0.5, 1.0, 1.5)  # of the commands recorded so far
+_BEYOND = 0.25  # of the recorded range: how far a joint may leave it
+_RUNS = 3  # more are no proposal: what a model leaves out would decide, not the cause
+_DECIDED = 34.3  # 4 (1.645 + 1.282)²
+_LEVEL = 0.4  # of its range: an effect that could not be tested
+_MOST = 3  # proposals
+_SURE = 1e6  # odds beyond which figures say nothing
+
+
+@dataclass(frozen=True)
+class _Question:
+    """Two explanations, and their names."""
+
+    names: tuple[str, str]
+    true: Point
+    other: Fit
+
+
+def experiments(
+    prepared: Prepared,
+    selection: Selection,
+    confused: Sequence[str],
+    untested: Sequence[Unit],
+    *,
+    generator: np.random.Generator,
+) -> tuple[dict[str, Any], ...]:
+    """Return the best experiments: excitation, what it separates, expected odds, and seconds.
+
+    Args:
+        prepared: Logs, noise, horizon.
+        selection: What the search found.
+        confused: Effects that the data cannot tell apart, the best model's first.
+        untested: Effects that the data could not show; asked for where nothing is confused.
+        generator: Of the excitations.
+    """
+    questions = _confusions(selection, confused) or _untested(selection, untested)
+    if not questions:
+        return ()
+    phi = selection.best.dispersion()
+    found: dict[tuple[str, str], dict[str, Any]] = {}
+    for name, log in _runs(prepared, questions[0].true, generator):
+        objective = _observed(prepared, log, questions[0].true)
+        if objective is None:
+            continue
+        duration = len(log) * prepared.predictor.system.control_dt
+        fits = {id(q.other): refit(objective, [q.other.point], iterations=0)[0] for q in questions}
+        shown = objective([q.true for q in questions])
+        for question, seen in zip(questions, shown, strict=True):
+            gain = _discrimination(fits[id(question.other)], question.other, seen)
+            runs = math.ceil(_DECIDED * phi / max(gain, 1e-9))
+            if runs > _RUNS:
+                continue
+            proposal = {
+                "excitation": name,
+                "separates": list(question.names),
+                "expected_odds": min(math.exp(min(gain * runs / (2 * phi), 30.0)), _SURE),
+                "seconds": round(runs * duration, 1),
+                "gain": gain,
+            }
+            known = found.get(question.names)
+            if known is None or gain > known["gain"]:
+                found[question.names] = proposal
+    best = sorted(found.values(), key=lambda p: (p["seconds"], -p["gain"]))[:_MOST]
+    return tuple({k: v for k, v in p.items() if k != "gain"} for p in best)
+
+
+def _confusions(selection: Selection, confused: Sequence[str]) -> list[_Question]:
+    if len(confused) < 2:
+        return []
+    best, questions = selection.best, {}
+    own = {unit.name for unit in best.units}
+    for rival in rivals(selection, confused[0]):
+        name = next(u.name for u in rival.units if u.name not in own)
+        pair = (confused[0], name)
+        questions.setdefault(pair, _Question(pair, best.fit.point, rival.fit))
+    return list(questions.values())
+
+
+def _untested(selection: Selection, units: Sequence[Unit]) -> list[_Question]:
+    fit, questions = selection.best.fit, {}
+    for unit in units:
+        point = Point(fit.point.z, {**fit.point.strengths, unit: _LEVEL * unit.high})
+        pair = (unit.name, "nothing")
+        questions.setdefault(pair, _Question(pair, point, fit))
+    return list(questions.values())
+
+
+def _runs(
+    prepared: Prepared, point: Point, generator: np.random.Generator
+) -> list[tuple[str, Log]]:
+    """Return experiments that keep within limits, as their logs would look without noise."""
+    logs = prepared.logs["train"]
+    dt = prepared.predictor.system.control_dt
+    steps = min(_STEPS, round(_SECONDS / dt))
+    commands = torch.cat([log.ctrl for log in logs]).numpy()
+    low, high = commands.min(0), commands.max(0)
+    model = prepared.predictor.system.task.model
+    limited = model.actuator_ctrllimited.astype(bool)
+    least = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf)
+    most = np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
+    found = []
+    for amplitude in _AMPLITUDES:
+        middle, half = (low + high) / 2, amplitude * (high - low) / 2
+        library = excitations(
+            np.maximum(middle - half, least),
+            np.minimum(middle + half, most),
+            steps=steps + 1,
+            dt=dt,
+            generator=generator,
+        )
+        for name, wave in library.items():
+            log = _played(prepared, wave, point)
+            if log is not None:
+                label = f"{name}, {amplitude:.0%} of the recorded commands"
+                found.append((label.replace("%", " %"), log))
+    return found
+
+
+def _played(prepared: Prepared, commands: Array, point: Point) -> Log | None:
+    """Return the run from where the first log began, nothing if it leaves what is known."""
+    first = prepared.logs["train"][0]
+    count = len(commands)
+    robot, predictor = prepared.predictor.system.robot, prepared.predictor
+    rest = replace(
+        first,
+        name="experiment",
+        time=torch.arange(count, dtype=torch.float64) * predictor.system.control_dt,
+        qpos=first.qpos[:1].repeat(count, 1),
+        qvel=torch.zeros(count, first.qvel.shape[1], dtype=torch.float64),
+        ctrl=torch.from_numpy(commands),
+        first_row=0,
+    )
+    whole = cut([rest], count - 1, history=prepared.sets["train"].segments.history)
+    theta = prepared.sets["train"].theta(point.z[None])
+    qpos, qvel = predictor.states(whole, theta, strengths_of([point], robot))
+    positions = np.concatenate([rest.qpos[:1].numpy(), qpos[0, 0]])
+    if not np.isfinite(positions).all() or _leaves(prepared, positions):
+        return None
+    velocities = np.concatenate([rest.qvel[:1].numpy(), qvel[0, 0]])
+    return replace(rest, qpos=torch.from_numpy(positions), qvel=torch.from_numpy(velocities))
+
+
+def _leaves(prepared: Prepared, positions: Array) -> bool:
+    """Return whether a hinge or slide goes far beyond where it has been."""
+    joints = list(prepared.predictor.system.robot.qpos_index)
+    seen = torch.cat([log.qpos for log in prepared.logs["train"]]).numpy()[:, joints]
+    low, high = seen.min(0), seen.max(0)
+    margin = _BEYOND * (high - low)
+    moved = positions[:, joints]
+    return bool(((moved < low - margin) | (moved > high + margin)).any())
+
+
+def _observed(prepared: Prepared, log: Log, point: Point) -> Objective | None:
+    """Return the objective on the segments of an experiment."""
+    train, predictor = prepared.sets["train"], prepared.predictor
+    history = train.segments.history
+    if len(log) <= prepared.horizon + history:
+        return None
+    pieces = cut_for_fits([log], prepared.horizon, history=history, most=_STEPS)
+    white = whitening(predictor, pieces, train.theta(point.z), prepared.noise)
+    return Objective(predictor, train.prior, pieces, white)
+
+
+def _discrimination(there: Fit, before: Fit, seen: Array) -> float:
+    """Return ``D``: what another explanation cannot imitate of what would be seen."""
+    apart = np.r_[(there.innovations - seen).ravel(), np.zeros(len(before.jacobian))]
+    derivatives = np.r_[there.jacobian, before.jacobian]
+    change = np.linalg.lstsq(derivatives, -apart, rcond=None)[0]
+    return float(((apart + derivatives @ change) ** 2).sum())
