@@ -32,6 +32,7 @@ _REMAINS = 0.01  # of the gap: not worth another effect
 _WRONG = 1.5  # mean squared innovation of a base that something is missing from
 _MOST = 4  # effects in one explanation
 _APART = 3  # effects without each of which a model is fitted with derivatives of its own
+_ALIKE = 4  # models with an effect of the same group in its place
 _RIVALS = 6  # models with another effect in the place of one
 
 
@@ -130,7 +131,9 @@ def select(
     alternatives = {}
     if best.units:
         progress("trying others in its place")
-        alternatives = _alternatives(train, validation, best, units=units, tried=tried)
+        alternatives = _alternatives(
+            train, validation, best, units=units, tried=tried, first=screens[0]
+        )
         tried += [model for models in alternatives.values() for model in models]
     return Selection(start, best, tuple(screens), tuple(p_values), tuple(tried), alternatives)
 
@@ -282,24 +285,34 @@ def _alternatives(
     *,
     units: Sequence[Unit],
     tried: Sequence[Model],
+    first: Screen,
 ) -> dict[str, tuple[Model, ...]]:
     """Return models with another effect in the place of each effect of the best one."""
+    start = tried[0]
     result: dict[str, tuple[Model, ...]] = {}
     names = list(dict.fromkeys(unit.name for unit in best.units))
     for name in names:
         kept = {u: s for u, s in best.fit.point.strengths.items() if u.name != name}
         known = [m for m in tried if _stands_in(m, kept, name)]
         if kept:
-            fits = refit(train, [Point(best.fit.point.z, kept)])
-            base = _judged(train, validation, fits)[0]
+            base = _judged(train, validation, refit(train, [Point(best.fit.point.z, kept)]))[0]
             left = [u for u in units if u not in kept and u.name != name]
-            strongest = compare(train, base.fit, left).seen.best(1.0)
-            order = sorted(strongest, key=lambda unit: -strongest[unit][0])
-            additions: dict[str, dict[Unit, float]] = {}
-            for unit in order:
-                if len(additions) < _RIVALS:
-                    additions.setdefault(unit.name, {unit: strongest[unit][1]})
-            known += _fitted(train, validation, base, list(additions.values()))
+            strongest, most = compare(train, base.fit, left).seen.best(1.0), _RIVALS
+        else:  # the search has tried those that stand out; what acts alike is a rival anyway
+            base, most = start, _ALIKE
+            groups = {u.effect.group for u in best.units}
+            seen = {name, *(u.name for m in known for u in m.units)}
+            strongest = {
+                unit: found
+                for unit, found in first.best(1.0).items()
+                if unit.effect.group in groups and unit.name not in seen
+            }
+        order = sorted(strongest, key=lambda unit: -strongest[unit][0])
+        additions: dict[str, dict[Unit, float]] = {}
+        for unit in order:
+            if len(additions) < most:
+                additions.setdefault(unit.name, {unit: strongest[unit][1]})
+        known += _fitted(train, validation, base, list(additions.values()))
         result[name] = tuple(known)
     return result
 
