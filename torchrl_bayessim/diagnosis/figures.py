@@ -109,7 +109,7 @@ def _measured(predictor: Predictor, segments: Segments) -> Array:
     tangent = np.concatenate([moved, segments.qvel[:, rows]], -1)
     tangent = tangent[..., list(predictor.system.channel_index)]
     scalar = np.array(predictor.system.robot.channel_joint) >= 0
-    values = predictor.values(segments.qpos[:, rows], segments.qvel[:, rows])
+    values = predictor.sensing.values(segments.qpos[:, rows], segments.qvel[:, rows])
     return np.where(scalar, values, tangent)
 
 

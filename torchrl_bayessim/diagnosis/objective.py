@@ -26,8 +26,9 @@ from ..effects.disturbance import ConstantForce
 from ..effects.effect import Effect
 from ..effects.robot import Robot
 from ..inference.priors import Prior
-from .prediction import Predictor, Strengths
+from .prediction import Predictor
 from .segments import Segments
+from .strengths import Strengths
 from .whitening import Whitening
 
 Array = NDArray[np.float64]

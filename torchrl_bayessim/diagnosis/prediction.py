@@ -8,7 +8,7 @@ once per candidate, effects on forces at every time step. What is returned is th
 
 from __future__ import annotations
 
-__all__ = ["Predictor", "Strengths"]
+__all__ = ["Predictor"]
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -23,27 +23,23 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from ..effects.effect import (
-    ActionEffect,
-    Effect,
     ForceEffect,
     Memory,
     ModelEffect,
-    SensorEffect,
 )
 from ..effects.fields import ModelFields
 from ..effects.forcing import Forcing
-from ..effects.sequence import command_sequence, measured_sequence, restored_sequence
 from ..envs.model_batch import ModelBatch
 from ..envs.stepper import Stepper
 from ..envs.task import Readings, Task
 from ..logs.system import System
+from .commands import commanded
 from .segments import Segments
+from .sensing import Sensing
+from .strengths import Strengths
 from .tangent import Tangent
 
 Array = NDArray[np.float64]
-Strengths = Mapping[Effect, Array]
-"""Strengths of the candidates, by effect: shape ``(P, N)`` for the effect's ``N`` targets."""
-
 _HELD = 0.010  # s that forces may be held while searching
 _ROWS = 30_000  # simulations per native call: bounds the memory, and costs nothing
 
@@ -73,6 +69,7 @@ class Predictor:
     Attributes:
         system: The robot.
         tangent: The tangent space of its positions.
+        sensing: Its measured channels.
         steps: Time steps simulated so far.
         exact: Whether forces follow the state at every time step, as in an environment, and not
             only every 10 ms, which is enough to tell effects apart.
@@ -81,6 +78,7 @@ class Predictor:
     def __init__(self, system: System, *, threads: int | None = None) -> None:
         self.system = system
         self.tangent = Tangent(system.task.model)
+        self.sensing = Sensing(system, self.tangent)
         self.steps = 0
         self.exact = False
         task = system.task
@@ -93,7 +91,6 @@ class Predictor:
         self._threads = threads
         self._stepper = Stepper(task.model, 1, drive=task.drive, threads=threads)
         self._forcing = Forcing(system.robot)
-        self._channels = np.array(system.channel_index, dtype=np.int64)
 
     @cached_property
     def finer(self) -> Predictor:
@@ -146,7 +143,7 @@ class Predictor:
             strengths: Of the effects that are on somewhere.
         """
         strengths = {} if strengths is None else strengths
-        restored = self._restored(segments, strengths, len(theta))
+        restored = self.sensing.restored(segments, strengths, len(theta))
         simulated = self._simulate(segments, theta, strengths, restored=restored)
         nq = self.system.task.model.nq
         return simulated[..., :nq], simulated[..., nq : nq + self.tangent.size]
@@ -154,9 +151,9 @@ class Predictor:
     def _residuals(
         self, segments: Segments, theta: Array, strengths: Strengths, offsets: Array | None
     ) -> Array:
-        restored = self._restored(segments, strengths, len(theta))
+        restored = self.sensing.restored(segments, strengths, len(theta))
         simulated = self._simulate(segments, theta, strengths, restored=restored, offsets=offsets)
-        return self._compare(segments, simulated, restored, strengths)
+        return self.sensing.compare(segments, simulated, restored, strengths)
 
     def _simulate(
         self,
@@ -169,7 +166,7 @@ class Predictor:
     ) -> Array:
         """Return what follows from the start states, shape ``(P, S, H, outputs)``."""
         count, size, horizon = len(theta), len(segments), segments.horizon
-        commands, sequence = self._commands(segments, strengths, count)
+        commands, sequence = commanded(self.system.robot, segments, strengths, count)
         self._write(theta, strengths)
         stepper, at = self._stepper, segments.history
         if stepper.num_envs != count * size:
@@ -177,7 +174,7 @@ class Predictor:
         stepper.use(self._models.repeated(size))
         stepper.state[:] = stepper.initial
         step = np.zeros((count, size, 2 * self.tangent.size))
-        step[..., self._channels] += restored[:, :, at] if restored is not None else 0.0
+        step[..., self.sensing.channels] += restored[:, :, at] if restored is not None else 0.0
         if offsets is not None:
             step += offsets if offsets.ndim == 3 else offsets[:, None]
         half = self.tangent.size
@@ -287,102 +284,6 @@ class Predictor:
             if isinstance(effect, ModelEffect):
                 effect.write(fields, torch.from_numpy(values), self.system.robot)
         fields.finish()
-
-    def _commands(
-        self, segments: Segments, strengths: Strengths, count: int
-    ) -> tuple[Array, NDArray[np.int64]]:
-        """Return the distinct command sequences, ``(B, H, A)``, and which each row follows."""
-        size, at = len(segments), segments.history
-        upto = at + segments.horizon
-        window = torch.from_numpy(segments.ctrl[:, :upto])
-        kinds = [(e, s) for e, s in strengths.items() if isinstance(e, ActionEffect)]
-        changed = np.zeros(count, dtype=bool)
-        for _, values in kinds:
-            changed |= values.any(1)
-        which = np.flatnonzero(changed)
-        plain = segments.ctrl[:, at:upto]
-        number = np.zeros(count, dtype=np.int64)
-        number[which] = 1 + np.arange(len(which))
-        sequence = (number[:, None] * size + np.arange(size)).reshape(-1)
-        if not len(which):
-            return np.ascontiguousarray(plain), sequence
-        time, robot = torch.from_numpy(segments.time[:, :upto]), self.system.robot
-        current = window.expand(len(which), *window.shape).clone()
-        for effect, values in kinds:
-            on = values[which].any(1)
-            if on.any():
-                strength = torch.from_numpy(values[which][on])[:, None]
-                current[torch.from_numpy(on)] = command_sequence(
-                    effect, current[torch.from_numpy(on)], strength, robot, time=time
-                )
-        distinct = np.concatenate([plain[None], current[:, :, at:].numpy()])
-        return np.ascontiguousarray(distinct.reshape(-1, *plain.shape[1:])), sequence
-
-    def _restored(self, segments: Segments, strengths: Strengths, count: int) -> Array | None:
-        """Return true minus measured channels over the windows, ``(P, S, W, C)``, or nothing."""
-        kinds = [(e, s) for e, s in strengths.items() if isinstance(e, SensorEffect)]
-        if not kinds:
-            return None
-        measured = torch.from_numpy(self.values(segments.qpos, segments.qvel))
-        true = measured.expand(count, *measured.shape).clone()
-        time, robot = torch.from_numpy(segments.time), self.system.robot
-        for effect, values in reversed(kinds):
-            on = torch.from_numpy(values.any(1))
-            if on.any():
-                strength = torch.from_numpy(values)[on][:, None]
-                true[on] = restored_sequence(effect, true[on], strength, robot, time=time)
-        return (true - measured).numpy()
-
-    def values(self, qpos: Array, qvel: Array) -> Array:
-        """Return what the channels of hinges and slides hold, zero for the others."""
-        values = np.zeros((*qpos.shape[:-1], len(self._channels)))
-        robot = self.system.robot
-        for c, (joint, kind) in enumerate(
-            zip(robot.channel_joint, robot.channel_kind, strict=True)
-        ):
-            if joint >= 0 and kind == "position":
-                values[..., c] = qpos[..., robot.qpos_index[joint]]
-            elif joint >= 0 and kind == "velocity":
-                values[..., c] = qvel[..., robot.dof_index[joint]]
-        return values
-
-    def _compare(
-        self, segments: Segments, simulated: Array, restored: Array | None, strengths: Strengths
-    ) -> Array:
-        """Return measured minus simulated, ``(P, S, K, C)``."""
-        nq = self.system.task.model.nq
-        rows, checked = segments.rows, segments.checked - 1
-        qpos, qvel = simulated[..., :nq], simulated[..., nq : nq + self.tangent.size]
-        with np.errstate(invalid="ignore"):
-            position = self.tangent.difference(qpos[:, :, checked], segments.qpos[:, rows])
-        velocity = segments.qvel[:, rows] - qvel[:, :, checked]
-        residual = np.concatenate([position, velocity], -1)[..., self._channels]
-        kinds = [(e, s) for e, s in strengths.items() if isinstance(e, SensorEffect)]
-        if restored is None or not kinds:
-            return residual
-        true = self.values(qpos, qvel)
-        before = self.values(segments.qpos, segments.qvel)[:, : segments.history + 1]
-        history = before + restored[:, :, : segments.history + 1]
-        wrong = self._seen(segments, history, true, kinds) - true
-        return residual - wrong[:, :, checked]
-
-    def _seen(
-        self,
-        segments: Segments,
-        history: Array,
-        true: Array,
-        kinds: Sequence[tuple[SensorEffect, Array]],
-    ) -> Array:
-        """Return what sensors show of simulated values, given the true ones before the start."""
-        record = torch.from_numpy(np.concatenate([history, true], axis=2))
-        time = torch.from_numpy(segments.time[:, : record.shape[2]])
-        robot = self.system.robot
-        for effect, values in kinds:
-            on = torch.from_numpy(values.any(1))
-            if on.any():
-                strength = torch.from_numpy(values)[on][:, None]
-                record[on] = measured_sequence(effect, record[on], strength, robot, time=time)
-        return record[:, :, segments.history + 1 :].numpy()
 
 
 def _parts(task: Task) -> int:

@@ -1,0 +1,48 @@
+"""What reaches the actuators: recorded commands, and what effects on commands make of them."""
+
+from __future__ import annotations
+
+__all__ = ["commanded"]
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..effects.effect import ActionEffect
+from ..effects.robot import Robot
+from ..effects.sequence import command_sequence
+from .segments import Segments
+from .strengths import Strengths
+
+Array = NDArray[np.float64]
+
+
+def commanded(
+    robot: Robot, segments: Segments, strengths: Strengths, count: int
+) -> tuple[Array, NDArray[np.int64]]:
+    """Return the distinct command sequences, ``(B, H, A)``, and which each row follows."""
+    size, at = len(segments), segments.history
+    upto = at + segments.horizon
+    window = torch.from_numpy(segments.ctrl[:, :upto])
+    kinds = [(e, s) for e, s in strengths.items() if isinstance(e, ActionEffect)]
+    changed = np.zeros(count, dtype=bool)
+    for _, values in kinds:
+        changed |= values.any(1)
+    which = np.flatnonzero(changed)
+    plain = segments.ctrl[:, at:upto]
+    number = np.zeros(count, dtype=np.int64)
+    number[which] = 1 + np.arange(len(which))
+    sequence = (number[:, None] * size + np.arange(size)).reshape(-1)
+    if not len(which):
+        return np.ascontiguousarray(plain), sequence
+    time = torch.from_numpy(segments.time[:, :upto])
+    current = window.expand(len(which), *window.shape).clone()
+    for effect, values in kinds:
+        on = values[which].any(1)
+        if on.any():
+            strength = torch.from_numpy(values[which][on])[:, None]
+            current[torch.from_numpy(on)] = command_sequence(
+                effect, current[torch.from_numpy(on)], strength, robot, time=time
+            )
+    distinct = np.concatenate([plain[None], current[:, :, at:].numpy()])
+    return np.ascontiguousarray(distinct.reshape(-1, *plain.shape[1:])), sequence
