@@ -1,7 +1,7 @@
 """Parameters and strengths that explain the segments best: many least-squares fits at once.
 
 All simulations that the fits of a batch ask for in an iteration are one call. Derivatives are
-finite differences, which effects such as a delay or a dead band also have; see `descent`.
+finite differences, which effects such as a delay or a dead band also have.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..inference.priors import BoxPrior
-from .descent import Descent
+from .levenberg_marquardt import LevenbergMarquardt
 from .objective import Objective, Point, Unit
 
 Array = NDArray[np.float64]
@@ -106,7 +106,7 @@ def refit(
     """
     models = [tuple(start.strengths) for start in starts]
     descents = [
-        Descent(
+        LevenbergMarquardt(
             _vector(start, units),
             _bounds(objective, units),
             size=objective.size,

@@ -29,6 +29,7 @@ _DEVIATIONS = 2.3  # of a normal distribution: one in a hundred
 _SHARE = 0.1  # of the gap: what an effect that could be another must remove to be kept
 _REST = 0.5  # of what the base leaves: what any further effect must remove
 _REMAINS = 0.01  # of the gap: not worth another effect
+_WHITE = 1.2  # mean squared innovation of a model that leaves noise alone
 _WRONG = 1.5  # mean squared innovation of a base that something is missing from
 _MOST = 4  # effects in one explanation
 _APART = 3  # effects without each of which a model is fitted with derivatives of its own
@@ -324,10 +325,16 @@ def _stands_in(model: Model, kept: dict[Unit, float], name: str) -> bool:
 
 
 def as_good(best: Model, rival: Model) -> bool:
-    """Return whether the segments do not say that the rival is worse."""
+    """Return whether the segments do not say that the rival is worse.
+
+    Where the best model leaves noise alone, the likelihood says so. Where something is still wrong
+    with both, it would be too sure, and the segments' differences count by how they vary.
+    """
     mine, others = best.deviances(), rival.deviances()
     if float((others - mine).sum()) / best.dispersion() < _LIKELY:
         return True
+    if float(mine.sum()) / (best.fit.innovations.size + best.validation.size) < _WHITE:
+        return False
     kinds = others - mine, np.log(others / mine)
     return max(_score(kind, best.logs) for kind in kinds) < _DEVIATIONS
 

@@ -10,7 +10,7 @@ and made anew only where a step fails that they had promised, or at the end.
 
 from __future__ import annotations
 
-__all__ = ["Descent"]
+__all__ = ["LevenbergMarquardt"]
 
 from collections.abc import Sequence
 
@@ -23,7 +23,7 @@ _CAREFUL = (3.0, 100.0)  # dampings tried after a step that failed, times the on
 _STUCK = 1e4  # damping beyond which there is nothing to gain
 
 
-class Descent:
+class LevenbergMarquardt:
     """Minimises ``‖r(x)‖² + Σ_{i<size} x_i²`` between bounds, asking for ``r`` where it needs it.
 
     Args:
