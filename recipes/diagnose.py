@@ -25,6 +25,7 @@ from torchrl_bayessim.diagnosis.page import write_page
 from torchrl_bayessim.errors import message
 from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.read import read_records
+from torchrl_bayessim.logs.record import Record
 from torchrl_bayessim.logs.sanity import Finding, check, usable_logs
 from torchrl_bayessim.logs.system import System
 
@@ -38,6 +39,7 @@ class Diagnosis(recipe.Settings):
 
     system: str = ""  # system.yaml
     data: str = ""  # a folder of CSV or Parquet files, a Minari dataset, a saved TensorDict
+    leave_out: str = ""  # logs whose names contain one of these, with commas between them
     effects: str = ""  # names with commas between them; the system's own by default
     horizon: int = 0  # control steps predicted at a time; 0: chosen from the data
     short: bool = False  # a smoke test: a diagnosis is one already
@@ -73,11 +75,23 @@ def read(settings: Diagnosis) -> tuple[System, list[Log], list[Finding]]:
     if settings.horizon < 0:
         raise ValueError(message("a horizon of 1 or more, or 0 to choose one", settings.horizon))
     system = System.load(settings.system)
-    records = read_records(settings.data, system)
+    records = kept(read_records(settings.data, system), settings.leave_out)
     findings = check(records, system, horizon=settings.horizon or SHORTEST)
     for finding in findings:
         print(finding)
     return system, usable_logs(records, system, findings), findings
+
+
+def kept(records: list[Record], leave_out: str) -> list[Record]:
+    """Return the records whose names contain none of the words."""
+    names = [record.name for record in records]
+    for word in leave_out.split(",") if leave_out else ():
+        records = [record for record in records if word.strip() not in record.name]
+        if not any(word.strip() in name for name in names):
+            raise ValueError(message("a part of a log's name to leave out", word, available=names))
+    if not records:
+        raise ValueError(message("logs beside those left out", "none", available=names))
+    return records
 
 
 def chosen(effects: str) -> list[str] | None:

@@ -146,6 +146,14 @@ def test_the_same_seed_gives_the_same_report(finished):
     assert first == second
 
 
+def test_logs_can_be_left_out(finished):
+    folder, _ = finished
+    diagnose(folder, "out=fewer", "leave_out=run3")
+    report = json.loads((folder / "fewer/report.json").read_text())
+    used = [*report["audit"]["train"], *report["audit"]["validation"], *report["audit"]["test"]]
+    assert sorted(used) == [f"run{run}.csv" for run in range(3)]
+
+
 def test_what_the_gate_finds_is_printed_and_in_the_report(finished, tmp_path):
     describe(tmp_path)
     for run in range(4):
@@ -207,6 +215,8 @@ def refused(tmp_path, capsys):
         ("effects=coulomb", "expected an effect of the catalogue, got 'coulomb'"),
         ("horizon=-1", "expected a horizon of 1 or more, or 0 to choose one, got -1"),
         ("horizon=200", "160 control steps in succession can be used, 201 are needed"),
+        ("leave_out=run7", "a part of a log's name to leave out, got 'run7'. Available: run0.csv"),
+        ("leave_out=run", "expected logs beside those left out, got 'none'"),
         ("sytem=robot.yaml", "system (did you mean this?)"),
     ],
 )
