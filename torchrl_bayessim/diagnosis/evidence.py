@@ -160,7 +160,7 @@ def _credit(selection: Selection) -> dict[str, float]:
     known = {frozenset(names): full, frozenset[str](): none}
     for model in selection.tried:
         inside = frozenset(u.name for u in model.units)
-        if inside < frozenset(names) and set(model.units) <= set(selection.best.units):
+        if inside and inside < frozenset(names) and set(model.units) <= set(selection.best.units):
             known[inside] = min(known.get(inside, np.inf), float(model.deviances().sum()))
 
     def value(some: frozenset[str]) -> float:
