@@ -4,10 +4,11 @@ from __future__ import annotations
 
 __all__ = ["confusion_set", "rivals", "settled"]
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from .objective import Objective
-from .selection import Model, Selection, as_good
+from .selection import Model, Selection, as_good, parts
 
 
 def confusion_set(selection: Selection, name: str) -> tuple[str, ...]:
@@ -34,10 +35,10 @@ def rivals(selection: Selection, name: str) -> list[Model]:
     return [m for m in selection.alternatives.get(name, ()) if as_good(selection.best, m)]
 
 
-def settled(selection: Selection, name: str, test: Objective) -> Selection:
+def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> Selection:
     """Return the selection with that one of equals in front that explains the test runs best."""
     equals = [selection.best, *rivals(selection, name)]
-    left = [float((one**2).sum()) for one in test([model.fit.point for model in equals])]
+    left = [float((one**2).sum()) for one in sets["test"]([model.fit.point for model in equals])]
     first = equals[left.index(min(left))]
     if first is selection.best:
         return selection
@@ -45,4 +46,5 @@ def settled(selection: Selection, name: str, test: Objective) -> Selection:
     new = next(u.name for u in first.units if u.name not in own)
     others = tuple(m for m in (selection.best, *selection.alternatives[name]) if m is not first)
     kept = {n: models for n, models in selection.alternatives.items() if n != name}
-    return replace(selection, best=first, alternatives={**kept, new: others})
+    tried = (*selection.tried, *parts(sets["train"], sets["validation"], first))
+    return replace(selection, best=first, tried=tried, alternatives={**kept, new: others})

@@ -58,7 +58,7 @@ def assemble(
     test = prepared.sets["test"]
     credit = _credit(selection)
     if credit:
-        selection = settled(selection, max(credit, key=credit.__getitem__), test)
+        selection = settled(selection, max(credit, key=credit.__getitem__), prepared.sets)
     best, nominal = selection.best, selection.nominal
     zero = Point(np.zeros_like(nominal.fit.point.z))
     measured = shrinkage(test, [zero, nominal.fit.point, best.fit.point], generator)

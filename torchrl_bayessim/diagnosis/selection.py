@@ -9,7 +9,7 @@ best few; afterwards every unit has to show that the model needs it.
 
 from __future__ import annotations
 
-__all__ = ["Model", "Selection", "as_good", "select"]
+__all__ = ["Model", "Selection", "as_good", "parts", "select"]
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -277,6 +277,16 @@ def _eliminated(train: Objective, validation: Objective, model: Model) -> tuple[
         model = smaller[best]
     there = refit(train, [model.fit.point], iterations=0)[0]
     return replace(model, fit=there), tried
+
+
+def parts(train: Objective, validation: Objective, model: Model) -> list[Model]:
+    """Return the model without each of its effects, fitted."""
+    strengths = model.fit.point.strengths
+    starts = [
+        Point(model.fit.point.z, {u: s for u, s in strengths.items() if u.name != out})
+        for out in dict.fromkeys(unit.name for unit in strengths)
+    ]
+    return _judged(train, validation, refit(train, starts))
 
 
 def _alternatives(
