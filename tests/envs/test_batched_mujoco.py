@@ -8,6 +8,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_env_specs
 
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+from torchrl_bayessim.envs.stepper import Drive
 from torchrl_bayessim.envs.task import Task, uniform_reset
 from torchrl_bayessim.envs.tasks.catalogue import known_task
 
@@ -254,3 +255,26 @@ def test_models_of_the_control_suite_run_open_loop(domain):
             mujoco.mj_step(model, data, nstep=2)
             expected = np.concatenate([data.qpos, data.qvel])
             np.testing.assert_array_equal(ahead[i, t].numpy(), expected)
+
+
+@pytest.mark.parametrize("name", ["Hopper-v5", "FetchPickAndPlace-v4"])
+def test_a_refused_action_leaves_no_trace(name):
+    disturbed, twin = (BatchedMujocoEnv(name, 2, seed=5, dtype=torch.float64) for _ in range(2))
+    steps = [env.reset() for env in (disturbed, twin)]
+    size = twin.action_spec.shape[-1]
+    actions = torch.linspace(-0.5, 0.5, 6 * size, dtype=torch.float64).reshape(3, 2, size)
+    for action in actions:
+        wrong = steps[0].clone().set("action", torch.zeros(2, size + 1, dtype=torch.float64))
+        with pytest.raises(ValueError, match=rf"actions of shape \(2, {size}\)"):
+            disturbed.step(wrong)
+        steps = [
+            env.step(td.set("action", action))["next"]
+            for env, td in zip((disturbed, twin), steps, strict=True)
+        ]
+        assert torch.equal(steps[0]["reward"], steps[1]["reward"])
+
+
+def test_a_weld_needs_a_mocap_body():
+    task = pendulum(drive=Drive(weld="pole"), bounds=(-np.ones(8), np.ones(8)))
+    with pytest.raises(ValueError, match="a mocap body, to which 'pole' is welded"):
+        BatchedMujocoEnv(task, 1)

@@ -37,7 +37,7 @@ from .whitening import whitening
 
 Array = NDArray[np.float64]
 _SECONDS, _STEPS = 10.0, 400  # of one run, at most
-_AMPLITUDES = (0.5, 1.0, 1.5)  # of the commands recorded so far
+_AMPLITUDES = (1.0, 1.5)  # of the commands recorded so far
 _BEYOND = 0.25  # of the recorded range: how far a joint may leave it
 _RUNS = 3  # more are no proposal: what a model leaves out would decide, not the cause
 _DECIDED = 34.3  # 4 (1.645 + 1.282)²

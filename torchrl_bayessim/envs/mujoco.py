@@ -192,6 +192,9 @@ class BatchedMujocoEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
+        if action.shape != self.action_spec.shape:
+            expected = f"actions of shape {tuple(self.action_spec.shape)}"
+            raise ValueError(message(expected, tuple(action.shape)))
         commands = self._commands(action.unsqueeze(1))
         self._outputs.reverse()
         self._readings.reverse()

@@ -116,6 +116,7 @@ class Stepper:
 
     Raises:
         SimulationError: The model has too little memory to be evaluated at all.
+        ValueError: ``drive.weld`` names a body, but the model has no mocap body.
 
     Attributes:
         models: The physics of each simulation.
@@ -279,6 +280,9 @@ def _resolve(
     relative = np.full(model.nu, -1, dtype=np.int64)
     for actuator in drive.relative:
         relative[actuator] = model.jnt_qposadr[model.actuator_trnid[actuator, 0]]
+    if drive.weld is not None and not model.nmocap:
+        expected = f"a model with a mocap body, to which {drive.weld!r} is welded"
+        raise ValueError(message(expected, "none", hint='<body mocap="true"> in the MJCF'))
     weld = -1 if drive.weld is None else model.body(drive.weld).id
     pinned = [model.joint(name).qposadr[0] for name in drive.pinned]
     site_ids = [model.site(name[len("site_velocity[") : -1]).id for name in sites]
