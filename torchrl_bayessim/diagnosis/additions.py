@@ -19,9 +19,8 @@ _PAIRS, _GROUPS = 4, 3  # at most
 def singles(seen: Screen) -> list[dict[Unit, float]]:
     """Return each effect at its best place, and at all of its targets together."""
     best = seen.best(1.0)
-    order = sorted(best, key=lambda unit: -best[unit][0])
     chosen: dict[tuple[str, bool], Unit] = {}
-    for unit in order:
+    for unit in best:
         if best[unit][0] > 2.0:
             chosen.setdefault((unit.name, unit.where == "all"), unit)
     return [{unit: best[unit][1]} for unit in chosen.values()]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["confusion_set", "rivals", "settled"]
+__all__ = ["confusion_set", "rivals", "settled", "stand_in"]
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,16 +23,18 @@ def confusion_set(selection: Selection, name: str) -> tuple[str, ...]:
     The first name is the effect's own.
     """
     own = {unit.name for unit in selection.best.units}
-    names = [name]
-    for rival in rivals(selection, name):
-        new = [u.name for u in rival.units if u.name not in own]
-        names += [other for other in dict.fromkeys(new) if other not in names]
-    return tuple(names)
+    others = [stand_in(selection, rival) for rival in rivals(selection, name)]
+    return tuple(dict.fromkeys([name, *(other for other in others if other not in own)]))
 
 
 def rivals(selection: Selection, name: str) -> list[Model]:
     """Return the models with another effect in the place of one that are as good as the best."""
     return [m for m in selection.alternatives.get(name, ()) if as_good(selection.best, m)]
+
+
+def stand_in(selection: Selection, rival: Model) -> str:
+    """Return the effect that a rival has in the place of one of the best model's."""
+    return next(unit.name for unit in rival.units if unit not in selection.best.units)
 
 
 def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> Selection:
@@ -42,9 +44,12 @@ def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> S
     first = equals[left.index(min(left))]
     if first is selection.best:
         return selection
-    own = {unit.name for unit in selection.best.units}
-    new = next(u.name for u in first.units if u.name not in own)
     others = tuple(m for m in (selection.best, *selection.alternatives[name]) if m is not first)
     kept = {n: models for n, models in selection.alternatives.items() if n != name}
     tried = (*selection.tried, *parts(sets["train"], sets["validation"], first))
-    return replace(selection, best=first, tried=tried, alternatives={**kept, new: others})
+    return replace(
+        selection,
+        best=first,
+        tried=tried,
+        alternatives={**kept, stand_in(selection, first): others},
+    )

@@ -26,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..logs.log import Log
-from .confusion import rivals
+from .confusion import rivals, stand_in
 from .excitations import excitations
 from .objective import Objective, Point, Unit, strengths_of
 from .preparation import Prepared, cut_for_fits
@@ -107,10 +107,8 @@ def _confusions(selection: Selection, confused: Sequence[str]) -> list[_Question
     if len(confused) < 2:
         return []
     best, questions = selection.best, {}
-    own = {unit.name for unit in best.units}
     for rival in rivals(selection, confused[0]):
-        name = next(u.name for u in rival.units if u.name not in own)
-        pair = (confused[0], name)
+        pair = (confused[0], stand_in(selection, rival))
         questions.setdefault(pair, _Question(pair, best.fit.point, rival.fit))
     return list(questions.values())
 

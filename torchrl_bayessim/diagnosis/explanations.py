@@ -65,14 +65,12 @@ def compare(train: Objective, base: Fit, units: Sequence[Unit], *, glance: bool 
         counts = Counter(unit.name for unit in units)
         whole = [u for u in units if u.where == "all" or counts[u.name] <= _APART]
         best = screen(thin.thinned(2), fit.thinned(2), whole).best(1.0)
-        order = sorted(best, key=lambda unit: -best[unit][0])
-        names = list(dict.fromkeys(unit.name for unit in order))[:_MATTER]
+        names = list(dict.fromkeys(unit.name for unit in best))[:_MATTER]
         units = [u for u in units if u in whole or u.name in names]
     coarse = screen(thin, fit, units)
     if glance or every == 1 or _plain(base):
         return Round(base, coarse.grown(every), thin, coarse, every)
-    best = coarse.best(1.0)
-    first = sorted(best, key=lambda unit: -best[unit][0])[:_MATTER]
+    first = list(coarse.best(1.0))[:_MATTER]
     together = [unit for on in [*pairs(coarse), *groups(coarse)] for unit in on]
     picks = list(dict.fromkeys([*first, *together]))
     fine = screen(train, base, picks)
@@ -160,7 +158,7 @@ def _everything(seen: Screen) -> dict[Unit, float]:
     """Return each effect at its best place and at all of its targets, and the better sign."""
     best = seen.best(1.0)
     chosen: dict[tuple[str, bool], Unit] = {}
-    for unit in sorted(best, key=lambda unit: -best[unit][0]):
+    for unit in best:
         chosen.setdefault((unit.name, unit.where == "all"), unit)
     return {unit: float(np.sign(best[unit][1])) or 1.0 for unit in chosen.values()}
 

@@ -66,7 +66,7 @@ class Screen:
         return np.maximum(self.scores, 0.0) ** 2 / dispersion
 
     def best(self, dispersion: float) -> dict[Unit, tuple[float, float]]:
-        """Return each unit's largest likelihood ratio and the strength that gives it."""
+        """Return each unit's largest likelihood ratio and its strength, the largest first."""
         result: dict[Unit, tuple[float, float]] = {}
         for unit, strength, ratio, score, norm in zip(
             self.units,
@@ -80,7 +80,7 @@ class Screen:
                 amplitude = max(score, 0.0) / norm if norm > 0 else 0.0
                 scaled = float(np.clip(amplitude, 0.1, 10.0) * strength)
                 result[unit] = float(ratio), unit.inside(scaled)
-        return result
+        return dict(sorted(result.items(), key=lambda item: -item[1][0]))
 
     def null(self, draws: int, generator: np.random.Generator) -> Array:
         """Return largest likelihood ratios under noise alone, shape ``(draws,)``."""

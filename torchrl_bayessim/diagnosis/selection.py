@@ -318,11 +318,10 @@ def _alternatives(
                 for unit, found in first.best(1.0).items()
                 if unit.effect.group in groups and unit.name not in seen
             }
-        order = sorted(strongest, key=lambda unit: -strongest[unit][0])
         additions: dict[str, dict[Unit, float]] = {}
-        for unit in order:
+        for unit, (_, strength) in strongest.items():
             if len(additions) < most:
-                additions.setdefault(unit.name, {unit: strongest[unit][1]})
+                additions.setdefault(unit.name, {unit: strength})
         known += _fitted(train, validation, base, list(additions.values()))
         result[name] = tuple(known)
     return result
