@@ -23,6 +23,7 @@ import torch
 from fetch_tasks import FETCH, MEASURED, GoalTask, paper
 from scipy.stats import binomtest
 from sim2real_ppo import Journal, confidence
+from tasks import true_parameters
 from torch import Tensor
 from training import Plan, Trained, scored, single_thread, train
 from video import record
@@ -68,7 +69,7 @@ def job(settings: Sim2RealFetch, out: Path) -> dict[str, Any]:
     single_thread()
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     task = chosen(settings)
-    truth = true_parameters(task, settings)
+    truth = true_parameters(task, settings.truth, seed=settings.seed)
     count = 16 if settings.short else 256
     score = GoalScore(task, Grid(truth[None]), episodes=count, seed=1_000_003)
     under_prior = GoalScore(task, task.prior, episodes=count, seed=1_000_033)
@@ -130,15 +131,6 @@ def chosen(settings: Sim2RealFetch) -> GoalTask:
         ddpg |= {"hidden": (32, 32), "batch_size": 64, "updates_per_frame": 0.02}
         task = replace(task, environments=8, shared_batches=1)
     return replace(task, warmup=warmup, updates=updates, ddpg=ddpg)
-
-
-def true_parameters(task: GoalTask, settings: Sim2RealFetch) -> Tensor:
-    """Return what the surrogate robot hides, in the prior's order."""
-    if settings.truth == "random":
-        return draw(task.prior, 1, key=(settings.seed, "truth"))[0]
-    if settings.truth != "nominal":
-        raise ValueError(message("a truth", settings.truth, available=["nominal", "random"]))
-    return torch.tensor([task.truth[name] for name in task.prior.names])
 
 
 class GoalScore:

@@ -23,7 +23,7 @@ from typing import Any
 
 import recipe
 import torch
-from tasks import TASKS, Task
+from tasks import TASKS, Task, true_parameters
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.record.loggers import get_logger
@@ -66,7 +66,7 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
     task = chosen(settings)
     if settings.short:
         settings.simulations, settings.updates = min(settings.simulations, 192), 2
-    truth = true_parameters(task, settings)
+    truth = true_parameters(task, settings.truth, seed=settings.seed)
     score = Score(task, truth, episodes=16 if settings.short else 100)
     if settings.logger not in LOGGERS:
         raise ValueError(message("a logger", settings.logger, available=LOGGERS))
@@ -122,15 +122,6 @@ def compare(returns: Tensor, baseline: Tensor) -> dict[str, Any]:
         "baseline": {"source": "prior", "real_return": mean, "real_return_ci": interval},
         "gain": {"real_return": gain, "real_return_ci": gain_interval},
     }
-
-
-def true_parameters(task: Task, settings: Sim2Real) -> Tensor:
-    """Return what the surrogate robot hides, in the prior's order."""
-    if settings.truth == "random":
-        return draw(task.prior, 1, key=(settings.seed, "truth"))[0]
-    if settings.truth != "nominal":
-        raise ValueError(message("a truth", settings.truth, available=["nominal", "random"]))
-    return torch.tensor([task.truth[name] for name in task.prior.names])
 
 
 def make_loop(

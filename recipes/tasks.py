@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import torch
+from torch import Tensor
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEnv
 
 from torchrl_bayessim.envs.classic_control.acrobot import AcrobotEnv
@@ -17,10 +19,12 @@ from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
 from torchrl_bayessim.envs.classic_control.mountain_car import MountainCarContinuousEnv
 from torchrl_bayessim.envs.classic_control.pendulum import PendulumEnv
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+from torchrl_bayessim.errors import message
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.physics.attributes import AttributePhysics
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
 from torchrl_bayessim.physics.protocol import Physics
+from torchrl_bayessim.sources import draw
 from torchrl_bayessim.summaries import Summary, duration, linear_dynamics
 from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
 
@@ -64,6 +68,24 @@ class Task:
             self.simulator(environments, seed),
             Compose(*transforms, StepCounter(self.max_steps), RewardSum()),
         )
+
+
+def true_parameters(task: Any, choice: str, *, seed: int) -> Tensor:
+    """Return what the surrogate robot hides, in the prior's order.
+
+    Args:
+        task: Has a ``prior`` and its own ``truth``, by name.
+        choice: ``nominal`` for the task's truth, ``random`` for a draw from the prior.
+        seed: Of the draw.
+
+    Raises:
+        ValueError: The choice is another.
+    """
+    if choice == "random":
+        return draw(task.prior, 1, key=(seed, "truth"))[0]
+    if choice != "nominal":
+        raise ValueError(message("a truth", choice, available=["nominal", "random"]))
+    return torch.tensor([task.truth[name] for name in task.prior.names])
 
 
 TASKS: dict[str, Task] = {
