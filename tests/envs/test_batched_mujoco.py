@@ -7,8 +7,8 @@ import torch
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv, check_env_specs
 
+from torchrl_bayessim.envs.drive import Drive
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
-from torchrl_bayessim.envs.stepper import Drive
 from torchrl_bayessim.envs.task import Task, uniform_reset
 from torchrl_bayessim.envs.tasks.catalogue import known_task
 

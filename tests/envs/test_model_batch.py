@@ -4,7 +4,7 @@ import pytest
 
 from torchrl_bayessim.envs.model_batch import ModelBatch
 from torchrl_bayessim.envs.stepper import Stepper
-from torchrl_bayessim.errors import PhysicsError, SimulationError
+from torchrl_bayessim.errors import PhysicsError
 from torchrl_bayessim.physics.assignments import assignments
 from torchrl_bayessim.physics.model_fields import resolve
 from torchrl_bayessim.physics.mujoco_models import MujocoModels
@@ -39,13 +39,13 @@ def trajectory(changed):
     return data.qpos
 
 
-def batched(field, indices, values, *, refresh=True):
+def batched(field, indices, values, *, refresh=True, command=0.0, substeps=100):
     arms = Stepper(model(), len(values), threads=1)
     arms.models.write(field, indices, np.asarray(values))
     if refresh:
         arms.models.refresh()
     arms.begin()
-    arms.rollout(np.zeros((len(values), 1, 1)), substeps=100)
+    arms.rollout(np.full((len(values), 1, 1), command), substeps=substeps)
     return arms["qpos"]
 
 
@@ -154,6 +154,22 @@ def test_repeated_physics_step_as_the_ones_they_repeat():
     assert (arms["qpos"][0] != arms["qpos"][1]).any()
 
 
+def test_other_physics_leave_nothing_of_the_former_behind():
+    """A thread's model, which the former physics have written to, is nominal elsewhere."""
+    arms = Stepper(model(), 2, threads=1)
+    arms.models.write("dof_damping", (0,), np.array([5.0, 6.0]))
+    arms.begin()
+    arms.rollout(np.ones((2, 1, 1)), substeps=1)
+    fresh = ModelBatch(model(), 2)
+    fresh.write("body_mass", (2,), np.array([0.1, 2.0]))
+    arms.use(fresh)
+    arms.state[:] = arms.initial
+    arms.begin()
+    arms.rollout(np.ones((2, 1, 1)), substeps=50)
+    alone = batched("body_mass", (2,), [0.1, 2.0], refresh=False, command=1.0, substeps=50)
+    np.testing.assert_array_equal(arms["qpos"], alone)
+
+
 def test_restored_models_are_nominal():
     arms = Stepper(model(), 2, threads=1)
     arms.models.write("body_mass", (2,), np.array([0.1, 2.0]))
@@ -204,12 +220,3 @@ def test_repeated_physics_keep_their_columns():
     again = models.repeated(3)
     again.refresh()
     np.testing.assert_array_equal(again.table, np.repeat(models.table, 3, axis=0))
-
-
-def test_a_model_without_room_to_be_evaluated_is_refused():
-    """Where MuJoCo's fatal error would end the process from compiled code."""
-    box = "<body pos='{} 0 .1'><freejoint/><geom type='box' size='.1 .1 .1'/></body>"
-    boxes = "".join(box.format(0.05 * i) for i in range(12))
-    crowded = f"<mujoco><size memory='8K'/><worldbody>{boxes}</worldbody></mujoco>"
-    with pytest.raises(SimulationError, match=r"with room for its computations.*stack overflow"):
-        Stepper(mujoco.MjModel.from_xml_string(crowded), 2)

@@ -1,7 +1,8 @@
 """MuJoCo's C functions and raw memory, as seen by compiled code.
 
 Addresses travel as integers. Symbols are resolved by name in the library that the ``mujoco``
-package loads, so compiled code can be cached on disk.
+package loads, so compiled code can be cached on disk. Functions that compute, and may therefore
+meet a fatal error, are `guarded`.
 """
 # ruff: noqa: ANN001, ANN202, ARG001 - numba infers types, and types intrinsics by example
 
@@ -35,6 +36,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from .fatal_errors import guarded
+
 for _library in glob.glob(os.path.join(os.path.dirname(mujoco.__file__), "libmujoco*")):
     llvm.load_library_permanently(_library)
 
@@ -48,13 +51,13 @@ def _external(name: str, *arguments: types.Type) -> types.ExternalFunction:
     return types.ExternalFunction(name, types.void(*arguments))
 
 
-mj_step = _external("mj_step", _pointer, _pointer)
-mj_forward = _external("mj_forward", _pointer, _pointer)
-mj_kinematics = _external("mj_kinematics", _pointer, _pointer)
-mj_com_pos = _external("mj_comPos", _pointer, _pointer)
+mj_step = guarded("mj_step")
+mj_forward = guarded("mj_forward")
+mj_kinematics = guarded("mj_kinematics")
+mj_com_pos = guarded("mj_comPos")
+mj_set_const = guarded("mj_setConst")
+mj_rne = guarded("mj_rnePostConstraint")
 mj_reset = _external("mj_resetData", _pointer, _pointer)
-mj_set_const = _external("mj_setConst", _pointer, _pointer)
-mj_rne = _external("mj_rnePostConstraint", _pointer, _pointer)
 mj_set_state = _external("mj_setState", _pointer, _pointer, _numbers, types.int32)
 mj_get_state = _external("mj_getState", _pointer, _pointer, _numbers, types.int32)
 mj_jac_site = _external("mj_jacSite", _pointer, _pointer, _numbers, _numbers, types.int32)

@@ -18,10 +18,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import PhysicsError, message
+from ..errors import PhysicsError, SimulationError, message
 from ..physics.assignments import Assignments
 from ..physics.frames import separate
 from . import native
+from .fatal_errors import FAULT_SIZE, fault_text
 
 # What mj_setConst derives from masses, inertias and geometry (engine_setconst.c); the visual
 # constants of cameras and lights, which it recomputes too, do not enter the dynamics.
@@ -77,6 +78,9 @@ class _Scratch:
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
+        self.fault = np.zeros(FAULT_SIZE, dtype=np.uint8)
+        addresses = self.fault.ctypes.data, self.model._address, self.data._address
+        self.owned = np.array(addresses, dtype=np.int64)
         self.columns = np.empty(0, dtype=np.int64)  # addresses of the table's columns
         self.derived = self.columns  # which columns are derived from others
 
@@ -195,6 +199,9 @@ class ModelBatch:
 
         Args:
             rows: Which environments to refresh, boolean, shape ``(N,)``; default all.
+
+        Raises:
+            SimulationError: MuJoCo cannot evaluate the physics of an environment.
         """
         if not self._scratch:
             self._scratch.append(_Scratch(self.model))
@@ -224,8 +231,10 @@ class ModelBatch:
             places = [c for key, c in self._columns.items() if key[0] in _DERIVED]
             scratch.derived = np.array(places, dtype=np.int64)
         columns, derived = scratch.columns, scratch.derived
-        model, data = scratch.model._address, scratch.data._address
-        native.refresh(model, data, rows, self.table, columns, derived)
+        bad = native.refresh(scratch.owned, rows, self.table, columns, derived)
+        if bad >= 0:
+            expected = f"physics that MuJoCo can evaluate, not those of environment {bad}"
+            raise SimulationError(message(expected, fault_text(scratch.fault)))
 
     def resize(self, num_envs: int) -> None:
         """Change the number of environments; new ones have the nominal physics."""
@@ -249,6 +258,10 @@ class ModelBatch:
         other._columns = dict(self._columns)
         other.table = np.repeat(self.table, count, axis=0)
         return other
+
+    def overrides(self, other: ModelBatch) -> bool:
+        """Return whether all entries that ``other`` overrides are overridden here."""
+        return other._columns.keys() <= self._columns.keys()
 
     def addresses(self, model: mujoco.MjModel) -> NDArray[np.int64]:
         """Return where the columns of the table belong in a copy of the model, shape ``(K,)``.

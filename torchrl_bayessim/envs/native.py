@@ -19,17 +19,33 @@ The arguments of the kernels, as `Stepper` builds them:
 * ``drive``: ``(relative, weld, pinned, site_ids, contact_forces)``, see `Drive`;
 * ``queue``: one integer, zero at the start, shared by the threads;
 * ``rows``: the environments to treat;
-* ``outputs``: where to write what was read.
+* ``outputs``: where to write what was read;
+* ``status``: where to write what became of each environment: 0, or one of
+
+  * `DIVERGED`: a number is not finite or too large, by MuJoCo's own tests;
+  * `OVERFLOW`: contacts or constraints did not fit in the model's memory;
+  * `FAILED`: MuJoCo gave a fatal error, see `fatal_errors`.
 """
 # ruff: noqa: ANN001, ANN201, ANN202, PLR0917 - numba infers types and takes no keywords
 
 from __future__ import annotations
 
-__all__ = ["DIVERGED", "OVERFLOW", "OWNED", "advance", "assign", "begin", "override", "refresh"]
+__all__ = [
+    "DIVERGED",
+    "FAILED",
+    "OVERFLOW",
+    "OWNED",
+    "advance",
+    "assign",
+    "begin",
+    "override",
+    "refresh",
+]
 
 import math
 
 import mujoco
+import numpy as np
 
 from .libmujoco import (
     compiled,
@@ -48,11 +64,12 @@ from .libmujoco import (
     take,
 )
 
-OWNED = ("model", "data", "warning", "qpos", "qvel", "ctrl")
+OWNED = ("fault", "model", "data", "warning", "qpos", "qvel", "ctrl")
 OWNED += ("mocap_pos", "mocap_quat", "xpos", "xquat")
-DIVERGED, OVERFLOW = 1, 2
+DIVERGED, OVERFLOW, FAILED = 1, 2, 3
 
-_MODEL, _DATA, _WARNING, _QPOS, _QVEL, _CTRL, _MOCAP_POS, _MOCAP_QUAT, _XPOS, _XQUAT = range(10)
+_FAULT, _MODEL, _DATA, _WARNING, _QPOS, _QVEL, _CTRL = range(7)
+_MOCAP_POS, _MOCAP_QUAT, _XPOS, _XQUAT = range(7, 11)
 _WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
 _STRIDE = 2  # an mjWarningStat is two 32-bit integers: lastinfo, number
 _CONTACTS_FULL = int(mujoco.mjtWarning.mjWARN_CONTACTFULL)
@@ -156,26 +173,28 @@ def _remember(thread, weld, state):
 @compiled
 def _control_step(thread, drive, substeps):
     _, _, pinned, _, contact_forces = drive
-    m, d = thread[_MODEL], thread[_DATA]
+    fault, m, d = thread[_FAULT], thread[_MODEL], thread[_DATA]
     for _ in range(substeps):
-        mj_step(m, d)
-        code = _trouble(thread)
+        code = FAILED if mj_step(fault, m, d) else _trouble(thread)
         if code:
             return code
+    failed = 0
     if pinned.shape[0]:
         qpos = doubles(thread[_QPOS])
         for j in pinned:
             qpos[j] = 0.0
-        mj_kinematics(m, d)
-        mj_com_pos(m, d)
-    if contact_forces:
-        mj_rne(m, d)
-    return 0
+        failed = mj_kinematics(fault, m, d) or mj_com_pos(fault, m, d)
+    if contact_forces and not failed:
+        failed = mj_rne(fault, m, d)
+    return FAILED if failed else 0
 
 
 @compiled
-def begin(worker, batch, drive, queue, rows, outputs):
-    """Set the states of ``rows`` in clean data, and evaluate the outputs there."""
+def begin(worker, batch, drive, queue, rows, outputs, status):
+    """Set the states of ``rows`` in clean data, and evaluate the outputs there.
+
+    Numbers that are not finite become 0 in ``outputs``, and the environment `DIVERGED`.
+    """
     thread, blocks, addresses, jacobian = worker
     table, sharing, state, signature = batch
     _, weld, _, site_ids, _ = drive
@@ -189,23 +208,33 @@ def begin(worker, batch, drive, queue, rows, outputs):
         _hush(thread)
         override(addresses, table, i // sharing)
         mj_set_state(m, d, _row(state, i), signature)
-        mj_forward(m, d)
+        status[i] = FAILED if mj_forward(thread[_FAULT], m, d) else _trouble(thread)
+        if status[i] == FAILED:
+            mj_reset(m, d)
+            continue
         mj_get_state(m, d, _row(state, i), signature)
         _remember(thread, weld, state[i])
         _collect(thread, blocks, site_ids, jacobian, outputs[i])
+        if not np.isfinite(state[i]).all():
+            status[i] = DIVERGED
+        for j in range(outputs.shape[1]):
+            if not math.isfinite(outputs[i, j]):
+                outputs[i, j] = 0.0
+                status[i] = DIVERGED
 
 
 @compiled
-def advance(worker, batch, drive, queue, rows, outputs, commands, sequence, substeps, status):
+def advance(worker, batch, drive, queue, rows, outputs, status, commands, sequence, substeps):
     """Apply ``commands[sequence[i]]``, shape ``(T, C)``, to each ``i`` of ``rows``.
 
-    Writes ``outputs[i]``, shape ``(T, M)``, the new state, and ``status[i]``. Where a simulation
-    diverges the state stays as it was and the outputs are NaN from that control step on.
+    Writes ``outputs[i]``, shape ``(T, M)``, and the new state. Where there is a ``status`` the
+    state stays as it was, and the outputs are NaN from that control step on.
     """
     thread, blocks, addresses, jacobian = worker
     table, sharing, state, signature = batch
     _, weld, _, site_ids, _ = drive
     m, d = thread[_MODEL], thread[_DATA]
+    pose = state[:0, 0]
     while True:
         k = take(queue.ctypes.data)
         if k >= rows.shape[0]:
@@ -214,6 +243,8 @@ def advance(worker, batch, drive, queue, rows, outputs, commands, sequence, subs
         _hush(thread)
         override(addresses, table, i // sharing)
         mj_set_state(m, d, _row(state, i), signature)
+        if weld >= 0:
+            pose = state[i, -7:].copy()
         code = 0
         for t in range(commands.shape[1]):
             if code == 0:
@@ -227,19 +258,25 @@ def advance(worker, batch, drive, queue, rows, outputs, commands, sequence, subs
         status[i] = code
         if code:
             mj_reset(m, d)
+            if weld >= 0:
+                state[i, -7:] = pose
         else:
             mj_get_state(m, d, _row(state, i), signature)
 
 
 @compiled
-def refresh(model, data, rows, table, addresses, derived):
+def refresh(owned, rows, table, addresses, derived):
     """Let MuJoCo recompute the constants that depend on the overrides of ``rows``.
 
-    ``addresses`` are those of the table's columns in the scratch ``model``, and ``derived`` the
-    columns that hold the constants.
+    ``owned`` are the addresses of a scratch fault, model and data, ``addresses`` those of the
+    table's columns in that model, and ``derived`` the columns that hold the constants. Returns the
+    first row for which MuJoCo cannot, or -1.
     """
     for i in rows:
         override(addresses, table, i)
-        mj_set_const(model, data)
+        if mj_set_const(owned[0], owned[1], owned[2]):
+            mj_reset(owned[1], owned[2])
+            return i
         for j in derived:
             table[i, j] = doubles(addresses[j])[0]
+    return -1

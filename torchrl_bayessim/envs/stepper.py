@@ -8,13 +8,11 @@ Threads work through the rows; see `native`.
 
 from __future__ import annotations
 
-__all__ = ["Drive", "Stepper"]
+__all__ = ["Stepper"]
 
-import copy
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -22,7 +20,10 @@ from numpy.typing import NDArray
 
 from ..errors import SimulationError, message
 from . import native
+from .drive import Drive, resolved
+from .fatal_errors import fault_text
 from .model_batch import ModelBatch
+from .worker import Worker, layout
 
 _SIGNATURE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _COMPONENTS = (
@@ -41,54 +42,6 @@ _COMPONENTS = (
     "userdata",
     "plugin",
 )
-
-
-@dataclass(frozen=True)
-class Drive:
-    """How a command enters the simulation, and what follows each control step.
-
-    A command is ``ctrl`` (``nu`` numbers) and, with ``weld``, the step of the first mocap body
-    from that body's present pose (3 + 4 numbers), which is how the Fetch arms are moved.
-
-    Attributes:
-        relative: Actuators whose control is added to the position of their joint.
-        weld: The body that the mocap body drags.
-        pinned: Joints whose position is set to zero after each control step; the places of bodies
-            and sites, but no forces, are then evaluated anew.
-        contact_forces: Compute ``cfrc_ext`` after each control step (``mj_rnePostConstraint``).
-    """
-
-    relative: tuple[int, ...] = ()
-    weld: str | None = None
-    pinned: tuple[str, ...] = ()
-    contact_forces: bool = False
-
-
-class _Worker:
-    """What one thread owns: a model, data, and where their numbers are."""
-
-    def __init__(self, model: mujoco.MjModel, outputs: tuple[str, ...]) -> None:
-        self.model = copy.copy(model)
-        self.data = mujoco.MjData(self.model)
-        self.jacobian = np.empty((6, model.nv))
-        arrays = [getattr(self.data, name).ctypes.data for name in native.OWNED[3:]]
-        warning = self.data.warning.number.ctypes.data
-        self.owned = np.array(
-            [self.model._address, self.data._address, warning, *arrays], dtype=np.int64
-        )
-        read = [_array(self.data, name) for name in outputs]
-        self.blocks = np.array(
-            [(array.ctypes.data, array.size) for array in read], dtype=np.int64
-        ).reshape(-1, 2)
-        self.addresses = np.empty(0, dtype=np.int64)
-
-
-def _array(data: mujoco.MjData, name: str) -> NDArray[np.float64]:
-    array = getattr(data, name, None)
-    if not isinstance(array, np.ndarray) or array.dtype != np.float64:
-        names = [n for n in dir(data) if isinstance(getattr(data, n), np.ndarray)]
-        raise ValueError(message("an array of MjData that holds doubles", name, available=names))
-    return array
 
 
 class Stepper:
@@ -115,15 +68,15 @@ class Stepper:
         threads: Threads to step with; default all cores that this process may use.
 
     Raises:
-        SimulationError: The model has too little memory to be evaluated at all.
-        ValueError: ``drive.weld`` names a body, but the model has no mocap body.
+        ValueError: ``drive.weld`` names a body, but the model has no mocap body; ``outputs`` names
+            what cannot be read; the model lets bodies sleep.
 
     Attributes:
         models: The physics of each simulation.
         state: States, shape ``(N, S)``.
         components: Where ``qpos``, ``qvel``, … are in a state; ``stepper["qpos"]`` is a view.
         initial: The model's initial state, shape ``(S,)``.
-        status: Of the last call: 0, `native.DIVERGED` or `native.OVERFLOW`, shape ``(N,)``.
+        status: Of the last call: 0, or `native.DIVERGED`, shape ``(N,)``.
         command_size: Numbers in a command.
     """
 
@@ -137,25 +90,28 @@ class Stepper:
         sharing: int = 1,
         threads: int | None = None,
     ) -> None:
+        if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+            expected = "a model whose bodies never sleep, since sleep is not part of a state"
+            hint = "model.opt.enableflags &= ~mujoco.mjtEnableBit.mjENBL_SLEEP"
+            raise ValueError(message(expected, '<flag sleep="enable"/>', hint=hint))
         drive = Drive() if drive is None else drive
         sites = [name for name in outputs if name.startswith("site_velocity[")]
         arrays = tuple(name for name in outputs if name not in sites)
         self._threads = threads or len(os.sched_getaffinity(0))
-        self._hire = lambda: _Worker(model, arrays)
+        self._hire = lambda: Worker(model, arrays)
         self._workers = [self._hire()]
         self._pool = ThreadPoolExecutor(max(1, self._threads - 1))
         self._queue = np.zeros(1, dtype=np.int64)
-        self._drive = _resolve(model, drive, sites)
+        self._drive = resolved(model, drive, sites)
         self._sharing = sharing
         self.command_size = model.nu + (0 if drive.weld is None else 7)
-        self.layout = _layout(self._workers[0].data, arrays + tuple(sites))
+        self.layout = layout(self._workers[0].data, arrays + tuple(sites))
         self.output_size = sum(int(np.prod(shape)) for _, shape in self.layout.values())
         self.components = _components(model, welded=drive.weld is not None)
         self.initial = np.zeros(max(part.stop for part in self.components.values()))
         size = mujoco.mj_stateSize(model, _SIGNATURE)
         data = mujoco.MjData(model)
         mujoco.mj_getState(model, data, self.initial[:size], _SIGNATURE)
-        _try_out(model, data)
         self.models = ModelBatch(model, num_envs // sharing, threads=self._threads)
         self.resize(num_envs)
 
@@ -175,9 +131,12 @@ class Stepper:
         if models.num_envs * self._sharing != self.num_envs:
             expected = f"the physics of {self.num_envs // self._sharing} environments"
             raise ValueError(message(expected, models.num_envs))
+        if models.overrides(self.models):
+            for worker in self._workers:  # the columns may be in another order
+                worker.addresses = np.empty(0, dtype=np.int64)
+        else:  # what the former physics override stands in the models of the workers
+            self._workers = [self._hire() for _ in self._workers]
         self.models = models
-        for worker in self._workers:  # the columns may be others
-            worker.addresses = np.empty(0, dtype=np.int64)
 
     def __getitem__(self, component: str) -> NDArray[np.float64]:
         """Return a view of a component of the states, such as ``qpos``, shape ``(N, size)``."""
@@ -196,7 +155,13 @@ class Stepper:
     def begin(
         self, rows: NDArray[np.int64] | None = None, *, outputs: NDArray[np.float64] | None = None
     ) -> None:
-        """Start the simulations ``rows`` in the states written to them (``mj_forward``)."""
+        """Start the simulations ``rows`` in the states written to them (``mj_forward``).
+
+        Where something is not finite the ``status`` says so, and the outputs have zeros there.
+
+        Raises:
+            SimulationError: The model has too little memory, or cannot be evaluated at all.
+        """
         rows = self._all if rows is None else rows
         outputs = self.outputs[:, 0] if outputs is None else outputs
         self._run(native.begin, rows, outputs)
@@ -226,7 +191,8 @@ class Stepper:
 
         Raises:
             ValueError: ``commands`` has another shape.
-            SimulationError: MuJoCo ran out of memory for contacts or constraints.
+            SimulationError: The model has too little memory, or MuJoCo gave another fatal error;
+                the environments that are named are as before, the others have advanced.
         """
         if commands.ndim != 3 or commands.shape[2] != self.command_size:
             expected = f"commands of shape (B, T, {self.command_size})"
@@ -235,76 +201,49 @@ class Stepper:
             outputs = np.empty((self.num_envs, commands.shape[1], self.output_size))
         rows = self._all if rows is None else rows
         sequence = self._all if sequence is None else sequence
-        self._run(native.advance, rows, outputs, commands, sequence, substeps, self.status)
-        full = rows[self.status[rows] == native.OVERFLOW].tolist()
-        if full:
-            expected = "room for all contacts and constraints"
-            hint = "raise <size memory='…'/> in the MJCF"
-            raise SimulationError(message(expected, f"environments {full} without", hint=hint))
+        self._run(native.advance, rows, outputs, commands, sequence, substeps)
         return outputs
 
-    def _run(self, kernel: Callable[..., None], *arguments: object) -> None:
+    def _run(
+        self,
+        kernel: Callable[..., None],
+        rows: NDArray[np.int64],
+        outputs: NDArray[np.float64],
+        *arguments: object,
+    ) -> None:
         """Let all threads work through the rows, this one among them."""
         self._queue[0] = 0
         batch = self.models.table, self._sharing, self.state, _SIGNATURE
+        shared = self._drive, self._queue, rows, outputs, self.status, *arguments
         calls = []
         for worker in self._workers:
             if len(worker.addresses) != self.models.table.shape[1]:
                 worker.addresses = self.models.addresses(worker.model)
             owned = worker.owned, worker.blocks, worker.addresses, worker.jacobian
-            calls.append((owned, batch, self._drive, self._queue, *arguments))
+            calls.append((owned, batch, *shared))
         futures = [self._pool.submit(kernel, *call) for call in calls[1:]]
         kernel(*calls[0])
         for future in futures:
             future.result()
+        self._raise_failures(rows)
 
-
-def _try_out(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Evaluate the model once from Python, where a fatal error of MuJoCo is an exception.
-
-    In compiled code it would end the process.
-    """
-    data.warning.number[:] = 1  # MuJoCo prints a warning only while its count is zero
-    try:
-        mujoco.mj_forward(model, data)
-    except mujoco.FatalError as error:
-        expected = "a model with room for its computations"
+    def _raise_failures(self, rows: NDArray[np.int64]) -> None:
+        status = self.status[rows]
+        if not (status > native.DIVERGED).any():
+            return
+        failed = rows[status == native.FAILED].tolist()
+        said = [text for text in (fault_text(worker.fault) for worker in self._workers) if text]
+        for worker in self._workers:
+            worker.fault[:] = 0
+        if failed:
+            expected = f"simulations that MuJoCo can compute, not environments {failed}"
+            memory = "stack" in said[0] or "memory" in said[0]
+            hint = "raise <size memory='…'/> in the MJCF" if memory else "check their physics"
+            raise SimulationError(message(expected, said[0], hint=hint))
+        full = rows[status == native.OVERFLOW].tolist()
+        expected = "room for all contacts and constraints"
         hint = "raise <size memory='…'/> in the MJCF"
-        raise SimulationError(message(expected, str(error).split("\n")[0], hint=hint)) from None
-
-
-def _resolve(
-    model: mujoco.MjModel, drive: Drive, sites: list[str]
-) -> tuple[NDArray[np.int64], int, NDArray[np.int64], NDArray[np.int64], bool]:
-    """Return the ``drive`` argument of the kernels: names replaced by addresses."""
-    relative = np.full(model.nu, -1, dtype=np.int64)
-    for actuator in drive.relative:
-        relative[actuator] = model.jnt_qposadr[model.actuator_trnid[actuator, 0]]
-    if drive.weld is not None and not model.nmocap:
-        expected = f"a model with a mocap body, to which {drive.weld!r} is welded"
-        raise ValueError(message(expected, "none", hint='<body mocap="true"> in the MJCF'))
-    weld = -1 if drive.weld is None else model.body(drive.weld).id
-    pinned = [model.joint(name).qposadr[0] for name in drive.pinned]
-    site_ids = [model.site(name[len("site_velocity[") : -1]).id for name in sites]
-    return (
-        relative,
-        weld,
-        np.array(pinned, dtype=np.int64),
-        np.array(site_ids, dtype=np.int64),
-        drive.contact_forces,
-    )
-
-
-def _layout(
-    data: mujoco.MjData, outputs: tuple[str, ...]
-) -> dict[str, tuple[int, tuple[int, ...]]]:
-    """Return where each output starts, and its shape."""
-    layout, start = {}, 0
-    for name in outputs:
-        shape = (6,) if name.startswith("site_velocity[") else getattr(data, name).shape
-        layout[name] = start, shape
-        start += int(np.prod(shape))
-    return layout
+        raise SimulationError(message(expected, f"environments {full} without", hint=hint))
 
 
 def _components(model: mujoco.MjModel, *, welded: bool) -> dict[str, slice]:

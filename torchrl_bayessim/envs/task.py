@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .draws import Draws
-from .stepper import Drive
+from .drive import Drive
 
 Readings = SimpleNamespace
 Reset = Callable[[Draws], Mapping[str, NDArray[np.float64]]]

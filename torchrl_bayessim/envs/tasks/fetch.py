@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..draws import Draws
-from ..stepper import Drive
+from ..drive import Drive
 from ..task import Readings, Task
 from .assets import robotics_model
 

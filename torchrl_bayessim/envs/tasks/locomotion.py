@@ -14,7 +14,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from ..stepper import Drive
+from ..drive import Drive
 from ..task import Readings, Task, uniform_reset
 from .assets import gymnasium_model
 
