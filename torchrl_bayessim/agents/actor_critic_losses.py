@@ -4,19 +4,28 @@ Where every reward lies in ``[low, high]``, returns lie in ``[low, high] / (1 - 
 outside can only be an error of the critic, which would then learn from it (Andrychowicz et al.
 2017, app. A). The actor minimises ``-Q(s, π(s)) + c · mean(π(s)²)``: where all actions look alike,
 the penalty keeps ``tanh`` out of its flat ends (ibid.).
+
+`critic_loss` gives the numbers of TorchRL's ``loss_value`` and ``value_loss``, `policy_loss` those
+of ``loss_actor`` and ``actor_loss`` and the penalty. TorchRL's put the parameters into the networks
+and take them out again at every call; here they stay in networks of their own.
 """
 
 from __future__ import annotations
 
-__all__ = ["BoundedDDPGLoss", "BoundedTD0", "BoundedTD3Loss"]
+__all__ = ["BoundedDDPGLoss", "BoundedTD0", "BoundedTD3Loss", "SoftUpdateAtOnce"]
 
-from typing import Any
+import copy
+from typing import Any, NamedTuple, TypedDict, Unpack
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch import Tensor
-from torchrl.objectives import DDPGLoss, TD3Loss
+from torch import Tensor, nn
+from torch.nn.functional import mse_loss
+from torch.optim.swa_utils import get_ema_multi_avg_fn
+from torchrl.objectives import DDPGLoss, LossModule, SoftUpdate, TD3Loss
 from torchrl.objectives.value import TD0Estimator
+from torchrl.objectives.value.functional import td0_return_estimate
 
 
 class BoundedTD0(TD0Estimator):
@@ -40,48 +49,98 @@ class BoundedTD0(TD0Estimator):
         """Return the bounded targets, shape ``(*, 1)``."""
         return super().value_estimate(*args, **options).clamp(*self.bounds)
 
+    def bounded(self, after: TensorDictBase, value: Tensor) -> Tensor:
+        """Return the same from a batch's ``next`` and ``V(s')``, shape ``(*, 1)``."""
+        reward, terminated = after.get("reward"), after.get("terminated")
+        return td0_return_estimate(self.gamma, value, reward, terminated).clamp(*self.bounds)
 
-class BoundedDDPGLoss(DDPGLoss):
-    """DDPG (Lillicrap et al. 2016): one critic, its target under the target actor.
 
-    Args:
-        actor: Reads states, writes ``action`` in [-1, 1].
-        critic: Reads the same and ``action``, writes ``state_action_value``.
+class Limits(TypedDict):
+    """What both losses know of the task.
+
+    Attributes:
         gamma: Discount per step.
         rewards: Least and greatest reward.
         action_l2: Weight c of the actor's mean squared action.
     """
 
+    gamma: float
+    rewards: tuple[float, float]
+    action_l2: float
+
+
+class _Networks(NamedTuple):
+    """Networks that hold a loss's parameters; critics of TD3 hold both and give ``(2, N, 1)``."""
+
+    actor: nn.Module
+    critic: nn.Module
+    judge: nn.Module  # the critic, or the first of two, as the actor sees it: without gradients
+    target_actor: nn.Module
+    target_critic: nn.Module
+
+
+class _Bounded(LossModule):
+    """What both losses share."""
+
+    def _limit(self, critic: str, limits: Limits) -> None:
+        """Bound targets and actions, and make the networks; ``critic`` is its attribute's name."""
+        self.action_l2 = limits["action_l2"]
+        self._value_estimator = BoundedTD0(
+            gamma=limits["gamma"],
+            rewards=limits["rewards"],
+            value_network=getattr(self, "actor_critic", None),
+        )
+        self._forward_value_estimator_keys()
+        # asked for by attribute, target parameters warn until someone updates them
+        parameters: Any = {
+            name: self._modules[f"{name}_params"]
+            for name in ("actor_network", "target_actor_network", critic, f"target_{critic}")
+        }
+        frozen = parameters[critic].detach()
+        judge = frozen[0] if frozen.batch_dims else frozen
+        # a tuple, so that they are no submodules and no parameter counts twice
+        self._networks = _Networks(
+            actor=_holding(self.actor_network, parameters["actor_network"]),
+            critic=_holding(getattr(self, critic), parameters[critic]),
+            judge=_holding(getattr(self, critic), judge),
+            target_actor=_holding(self.actor_network, parameters["target_actor_network"]),
+            target_critic=_holding(getattr(self, critic), parameters[f"target_{critic}"]),
+        )
+
+    def policy_loss(self, batch: TensorDictBase) -> Tensor:
+        """Return the actor's loss, by the (first) critic."""
+        state = batch.get("state")
+        action = self._networks.actor(state)
+        value = self._networks.judge(state, action)
+        return -value.mean() + self.action_l2 * action.square().mean()
+
+
+class BoundedDDPGLoss(_Bounded, DDPGLoss):
+    """DDPG (Lillicrap et al. 2016): one critic, its target under the target actor.
+
+    Args:
+        actor: Reads ``state``, writes ``action`` in [-1, 1].
+        critic: Reads both, writes ``state_action_value``.
+        limits: See `Limits`.
+    """
+
     def __init__(
-        self,
-        actor: TensorDictModule,
-        critic: TensorDictModule,
-        *,
-        gamma: float,
-        rewards: tuple[float, float],
-        action_l2: float,
+        self, actor: TensorDictModule, critic: TensorDictModule, **limits: Unpack[Limits]
     ) -> None:
         super().__init__(actor, critic, loss_function="l2", delay_actor=True, delay_value=True)
-        self.action_l2 = action_l2
-        estimator = BoundedTD0(gamma=gamma, rewards=rewards, value_network=self.actor_critic)
-        self._value_estimator = estimator
-        self._forward_value_estimator_keys()
+        self._limit("value_network", limits)
 
     def critic_loss(self, batch: TensorDictBase) -> Tensor:
         """Return the mean squared error of the critic."""
-        return self.loss_value(batch)[0]
-
-    def policy_loss(self, batch: TensorDictBase) -> Tensor:
-        """Return the actor's loss."""
-        critic = self._cached_detached_value_params
-        with self.actor_network_params.to_module(self.actor_network):
-            acted = self.actor_network(batch.select(*self.actor_in_keys))
-        with critic.to_module(self.value_network):
-            value = self.value_network(acted)["state_action_value"]
-        return -value.mean() + self.action_l2 * acted["action"].square().mean()
+        networks, after = self._networks, batch.get("next")
+        with torch.no_grad():
+            state = after.get("state")
+            value = networks.target_critic(state, networks.target_actor(state))
+            target = self._value_estimator.bounded(after, value)
+        return mse_loss(networks.critic(batch.get("state"), batch.get("action")), target)
 
 
-class BoundedTD3Loss(TD3Loss):
+class BoundedTD3Loss(_Bounded, TD3Loss):
     """TD3 (Fujimoto et al. 2018): the lower of two critics, under noisy target actions.
 
     Its delayed actor is the caller's part: ask for `policy_loss` less often than `critic_loss`.
@@ -89,29 +148,43 @@ class BoundedTD3Loss(TD3Loss):
     """
 
     def __init__(
-        self,
-        actor: TensorDictModule,
-        critic: TensorDictModule,
-        *,
-        gamma: float,
-        rewards: tuple[float, float],
-        action_l2: float,
+        self, actor: TensorDictModule, critic: TensorDictModule, **limits: Unpack[Limits]
     ) -> None:
         bounds: Any = (-1.0, 1.0)
         super().__init__(actor, critic, bounds=bounds, loss_function="l2")
-        self.action_l2 = action_l2
-        self._value_estimator = BoundedTD0(gamma=gamma, rewards=rewards)
-        self._forward_value_estimator_keys()
+        self._limit("qvalue_network", limits)
 
     def critic_loss(self, batch: TensorDictBase) -> Tensor:
         """Return the mean squared errors of both critics, added."""
-        return self.value_loss(batch)[0]
+        networks, after, action = self._networks, batch.get("next"), batch.get("action")
+        noise = torch.randn_like(action) * self.policy_noise
+        noise = noise.clamp(-self.noise_clip, self.noise_clip)
+        with torch.no_grad():
+            state = after.get("state")
+            following = (networks.target_actor(state) + noise).clamp(-1.0, 1.0)
+            value = networks.target_critic(state, following).amin(0)
+            target = self._value_estimator.bounded(after, value)
+        found = networks.critic(batch.get("state"), action)
+        return mse_loss(found, target.expand_as(found), reduction="none").sum(0).mean()
 
-    def policy_loss(self, batch: TensorDictBase) -> Tensor:
-        """Return the actor's loss, by the first critic."""
-        critic = self._cached_detach_qvalue_network_params[0]
-        with self.actor_network_params.to_module(self.actor_network):
-            acted = self.actor_network(batch.select(*self.actor_network.in_keys))
-        with critic.to_module(self.qvalue_network):
-            value = self.qvalue_network(acted)["state_action_value"]
-        return -value.mean() + self.action_l2 * acted["action"].square().mean()
+
+class SoftUpdateAtOnce(SoftUpdate):
+    """TorchRL's ``θ' ← (1 - τ) θ' + τ θ``, for all parameters in one call."""
+
+    def __init__(self, loss: LossModule, *, tau: float) -> None:
+        super().__init__(loss, tau=tau)
+        self._average = get_ema_multi_avg_fn(self.eps)
+        sources, targets = self._sources.flatten_keys("."), self._targets.flatten_keys(".")
+        pairs = [(targets[f"target_{name}"], source) for name, source in sources.items()]
+        self._to, self._from = zip(*((t.data, s.data) for t, s in pairs), strict=True)
+
+    def step(self) -> None:
+        """Let the target networks follow."""
+        self._average(self._to, self._from, None)
+
+
+def _holding(network: Any, parameters: TensorDictBase) -> nn.Module:
+    """Return a copy of a `TensorDictModule`'s network in which these very parameters are."""
+    held = copy.deepcopy(network.module)
+    parameters["module"].to_module(held)
+    return held

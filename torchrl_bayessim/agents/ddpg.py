@@ -19,11 +19,10 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.objectives import SoftUpdate
 
 from ..errors import SimulationError, message
 from ..randomness import isolated
-from .actor_critic_losses import BoundedDDPGLoss, BoundedTD3Loss
+from .actor_critic_losses import BoundedDDPGLoss, BoundedTD3Loss, SoftUpdateAtOnce
 from .goal_networks import GOAL_KEYS, Actor, Critic, GoalState, action_bounds, goal_policy
 from .hindsight import GoalReward, HindsightReplayBuffer
 
@@ -141,7 +140,7 @@ class DDPG:
         self.buffer = HindsightReplayBuffer(
             reward, capacity=capacity, share=relabelled, moving=moving
         )
-        self._targets = SoftUpdate(self._loss, tau=tau)
+        self._targets = SoftUpdateAtOnce(self._loss, tau=tau)
         self._optimizers = {
             part: torch.optim.Adam(self._parameters(part), lr=learning_rate, fused=True)
             for part in ("actor", "critic")

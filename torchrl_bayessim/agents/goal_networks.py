@@ -92,7 +92,10 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """A ReLU network of the whole state and the action in [-1, 1]."""
+    """A ReLU network of the whole state and the action in [-1, 1].
+
+    With the parameters of K critics stacked, as TorchRL's TD3 has them, it gives ``(K, N, 1)``.
+    """
 
     def __init__(self, inputs: int, hidden: Sequence[int]) -> None:
         super().__init__()
@@ -154,12 +157,22 @@ def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
     return spec.low, spec.high
 
 
+class _Linear(nn.Linear):
+    """A linear layer, or several of them where weights have the shape ``(K, D', D)``."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.weight.ndim == 2:
+            return super().forward(x)
+        rows = x.expand(len(self.weight), *x.shape[-2:])
+        return torch.baddbmm(self.bias.unsqueeze(-2), rows, self.weight.mT)
+
+
 def _relu_network(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
     """Return linear layers with ReLU between; Glorot's initial weights, biases of zero."""
     widths = [inputs, *hidden, outputs]
     layers: list[nn.Module] = []
     for before, after in pairwise(widths):
-        layer = nn.Linear(before, after)
+        layer = _Linear(before, after)
         nn.init.xavier_uniform_(layer.weight)
         nn.init.zeros_(layer.bias)
         layers += [layer, nn.ReLU()]
