@@ -31,17 +31,20 @@ def originals(name):
 
 
 def vary(env, envs):
-    """Write the same differing masses and frictions to both."""
+    """Write the same differing masses, frictions and time steps to both."""
     for body in range(1, env.task.model.nbody):
         factor = 1.0 + 0.1 * np.arange(N)
         env.models.write("body_mass", (body,), env.task.model.body_mass[body] * factor)
     for geom in range(env.task.model.ngeom):
         friction = env.task.model.geom_friction[geom, 0] * (1.0 - 0.2 * np.arange(N))
         env.models.write("geom_friction", (geom, 0), friction)
+    timestep = env.task.model.opt.timestep * (1.0 - 0.1 * np.arange(N))
+    env.models.write("opt.timestep", (), timestep)
     env.models.refresh()
     for i, original in enumerate(envs):
         original.model.body_mass[:] *= 1.0 + 0.1 * i
         original.model.geom_friction[:, 0] *= 1.0 - 0.2 * i
+        original.model.opt.timestep *= 1.0 - 0.1 * i
         mujoco.mj_setConst(original.model, mujoco.MjData(original.model))
 
 

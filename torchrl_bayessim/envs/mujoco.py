@@ -15,13 +15,14 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ..errors import message
 from .additions import Addition, rollout_with
+from .components import chosen_rows, finite_rows
 from .draws import Draws
 from .model_batch import ModelBatch
+from .specs import specs
 from .stepper import Stepper
 from .task import Readings, Task
 from .tasks.catalogue import known_task
@@ -66,11 +67,8 @@ class BatchedMujocoEnv(EnvBase):
         max_steps: int | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        for name, value in {
-            "num_envs": num_envs,
-            "max_steps": max_steps,
-            "threads": threads,
-        }.items():
+        counts = {"num_envs": num_envs, "max_steps": max_steps, "threads": threads}
+        for name, value in counts.items():
             if value is not None and not (isinstance(value, int) and value > 0):
                 raise ValueError(message(f"{name} to be a positive integer", value))
         super().__init__(batch_size=torch.Size([num_envs]))
@@ -93,13 +91,17 @@ class BatchedMujocoEnv(EnvBase):
         self._episodes = np.zeros(num_envs, dtype=np.int64)
         self._elapsed = torch.zeros(num_envs, 1, dtype=torch.int64)
         self._extras: dict[str, Tensor] = {}
+        self._dt = torch.empty(num_envs, dtype=torch.float64)
         # outputs after the last control step and before it, exchanged at every step
         size = num_envs, 1, self.stepper.output_size
         self._outputs = [np.zeros(size), np.zeros(size)]
         self._start(np.arange(num_envs))
         self._episodes[:] = 0
         self._readings = [self._read(outputs[:, 0]) for outputs in self._outputs]
-        self._make_specs()
+        observed, truncates = self._observe(self.readings), self.max_steps is not None
+        for name, spec in specs(self.task, observed, self.batch_size, truncates=truncates).items():
+            setattr(self, name, spec)
+        self.task.verify(self.readings, self.action_spec.zero())
 
     @property
     def models(self) -> ModelBatch:
@@ -126,17 +128,17 @@ class BatchedMujocoEnv(EnvBase):
 
         Raises:
             KeyError: There is no such component.
-            ValueError: A component has another shape, or is not finite.
+            ValueError: A component or the mask has another shape, or is not finite.
         """
-        known = [*self.stepper.components, *self._extras]
+        sizes = {name: self.stepper[name].shape[1] for name in self.stepper.components}
+        sizes |= {name: value.shape[1] for name, value in self._extras.items()}
+        given = {}
         for name, value in components.items():
-            if name not in known:
-                raise KeyError(message("a component of the state", name, available=known))
-            if len(value) != self.num_envs or not torch.as_tensor(value).isfinite().all():
-                expected = f"{self.num_envs} rows of finite numbers for {name}"
-                raise ValueError(message(expected, value))
-        rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
-        self._start(rows, {name: np.asarray(value)[rows] for name, value in components.items()})
+            if name not in sizes:
+                raise KeyError(message("a component of the state", name, available=sizes))
+            given[name] = finite_rows(name, value, (self.num_envs, sizes[name]))
+        rows = chosen_rows(mask, self.num_envs)
+        self._start(rows, {name: value[rows] for name, value in given.items()})
         return self._started()
 
     def add(self, key: object, addition: Addition) -> None:
@@ -165,8 +167,8 @@ class BatchedMujocoEnv(EnvBase):
             ValueError: The shape is another, or an action is not finite.
         """
         size = self.action_spec.shape[-1]
-        if actions.ndim != 3 or (actions.shape[0], actions.shape[2]) != (self.num_envs, size):
-            expected = f"actions of shape ({self.num_envs}, T, {size})"
+        if actions.ndim != 3 or actions.shape != (self.num_envs, actions.shape[1] or 1, size):
+            expected = f"actions of shape ({self.num_envs}, T, {size}), T at least 1"
             raise ValueError(message(expected, tuple(actions.shape)))
         outputs = self._advance(self._commands(actions))
         before = self._read(np.concatenate([self._outputs[0], outputs[:, :-1]], axis=1))
@@ -186,8 +188,7 @@ class BatchedMujocoEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
-        self._start(rows)
+        self._start(chosen_rows(None if mask is None else mask.flatten(), self.num_envs))
         return self._started()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -212,6 +213,7 @@ class BatchedMujocoEnv(EnvBase):
         self, commands: NDArray[np.float64], outputs: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
         substeps = self.task.frame_skip
+        self._time()
         if not self._additions:
             return self.stepper.rollout(commands, substeps=substeps, outputs=outputs)
         added = rollout_with(self.stepper, self._additions.values(), commands, substeps=substeps)
@@ -225,25 +227,36 @@ class BatchedMujocoEnv(EnvBase):
         """Begin the next episode of ``rows``, in the states that the task draws or ``given``."""
         stepper = self.stepper
         stepper.state[rows] = stepper.initial
-        components = dict(self.task.initial)
+        initial = self.task.initial
+        components = {k: np.broadcast_to(v, (len(rows), len(v))) for k, v in initial.items()}
         if self.task.reset is not None:
             components |= self.task.reset(Draws(self._seed, rows, self._episodes[rows]))
         components |= given or {}
         for name, value in components.items():
             if name in stepper.components:
-                stepper[name][rows] = value
+                part = stepper[name]
+                part[rows] = finite_rows(name, value, (len(rows), part.shape[1]))
             else:
-                if name not in self._extras:
-                    self._extras[name] = torch.zeros(self.num_envs, np.shape(value)[-1]).double()
-                self._extras[name][rows] = torch.as_tensor(value)
+                size = np.shape(value)[-1]
+                extra = self._extras.setdefault(name, torch.zeros(self.num_envs, size).double())
+                extra[rows] = torch.from_numpy(finite_rows(name, value, (len(rows), size)))
         self._episodes[rows] += 1
         self._elapsed[rows] = 0
+        self._time()
         stepper.begin(rows, outputs=self._outputs[0][:, 0])
+        if "weld_pose" in components:  # it may be older than the positions, as in a recording
+            stepper["weld_pose"][rows] = components["weld_pose"]
+
+    def _time(self) -> None:
+        """Let ``readings.dt`` follow the physics."""
+        step = self.models.read("opt.timestep", ())
+        self._dt.copy_(torch.from_numpy(step * self.task.frame_skip))
 
     def _started(self) -> TensorDictBase:
         no = torch.zeros(self.num_envs, 1, dtype=torch.bool)
         flags = {key: no.clone() for key in self.done_keys}
-        source = {**self._observe(self.readings), **flags, "diverged": no}
+        diverged = torch.from_numpy(self.stepper.status != 0).unsqueeze(-1)
+        source = {**self._observe(self.readings), **flags, "diverged": diverged}
         return TensorDict(source, batch_size=self.batch_size)
 
     def _commands(self, actions: Tensor) -> NDArray[np.float64]:
@@ -258,7 +271,7 @@ class BatchedMujocoEnv(EnvBase):
         readings = {
             name: torch.from_numpy(self.stepper.view(outputs, name)) for name in self.stepper.layout
         }
-        for name, value in self._extras.items():
+        for name, value in {**self._extras, "dt": self._dt}.items():
             readings[name] = value if outputs.ndim == 2 else value.unsqueeze(1)
         return Readings(**readings)
 
@@ -284,20 +297,3 @@ class BatchedMujocoEnv(EnvBase):
         else:
             source["done"] = terminated.clone()
         return TensorDict(source, batch_size=elapsed.shape[:-1])
-
-    def _make_specs(self) -> None:
-        batch, task = self.batch_size, self.task
-        observed = self._observe(self.readings)
-        entries = {k: Unbounded(shape=v.shape, dtype=v.dtype) for k, v in observed.items()}
-        flag = Binary(1, shape=torch.Size((*batch, 1)), dtype=torch.bool)
-        self.observation_spec = Composite({**entries, "diverged": flag}, shape=batch)
-        low, high = task.model.actuator_ctrlrange.T if task.bounds is None else task.bounds
-        size = torch.Size((*batch, len(low)))
-        if task.bounds is None and not task.model.actuator_ctrllimited.all():
-            self.action_spec = Unbounded(shape=size, dtype=torch.float32)
-        else:
-            low, high = (torch.as_tensor(b).float().expand(size).clone() for b in (low, high))
-            self.action_spec = Bounded(low=low, high=high, shape=size, dtype=torch.float32)
-        self.reward_spec = Unbounded(shape=torch.Size((*batch, 1)), dtype=self._dtype)
-        flags = ["done", "terminated"] + ["truncated"] * (self.max_steps is not None)
-        self.done_spec = Composite({name: flag.clone() for name in flags}, shape=batch)

@@ -45,7 +45,6 @@ __all__ = [
 import math
 
 import mujoco
-import numpy as np
 
 from .libmujoco import (
     compiled,
@@ -65,12 +64,13 @@ from .libmujoco import (
 )
 
 OWNED = ("fault", "model", "data", "warning", "qpos", "qvel", "ctrl")
-OWNED += ("mocap_pos", "mocap_quat", "xpos", "xquat")
+OWNED += ("mocap_pos", "mocap_quat", "xpos", "xquat", "qacc")
 DIVERGED, OVERFLOW, FAILED = 1, 2, 3
 
 _FAULT, _MODEL, _DATA, _WARNING, _QPOS, _QVEL, _CTRL = range(7)
-_MOCAP_POS, _MOCAP_QUAT, _XPOS, _XQUAT = range(7, 11)
+_MOCAP_POS, _MOCAP_QUAT, _XPOS, _XQUAT, _QACC = range(7, 12)
 _WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
+_LARGEST = mujoco.mjMAXVAL
 _STRIDE = 2  # an mjWarningStat is two 32-bit integers: lastinfo, number
 _CONTACTS_FULL = int(mujoco.mjtWarning.mjWARN_CONTACTFULL)
 _CONSTRAINTS_FULL = int(mujoco.mjtWarning.mjWARN_CNSTRFULL)
@@ -118,6 +118,16 @@ def _trouble(thread):
                 return DIVERGED
             code = OVERFLOW
     return code
+
+
+@compiled
+def _bounded(address, size):
+    """Whether all numbers are what MuJoCo takes for sane (``mj_checkVel``, ``mj_checkAcc``)."""
+    numbers = doubles(address)
+    sane = True
+    for j in range(size):
+        sane = sane and abs(numbers[j]) <= _LARGEST
+    return sane
 
 
 @compiled
@@ -193,7 +203,7 @@ def _control_step(thread, drive, substeps):
 def begin(worker, batch, drive, queue, rows, outputs, status):
     """Set the states of ``rows`` in clean data, and evaluate the outputs there.
 
-    Numbers that are not finite become 0 in ``outputs``, and the environment `DIVERGED`.
+    Outputs that are not finite become 0, and the environment `DIVERGED`.
     """
     thread, blocks, addresses, jacobian = worker
     table, sharing, state, signature = batch
@@ -215,7 +225,8 @@ def begin(worker, batch, drive, queue, rows, outputs, status):
         mj_get_state(m, d, _row(state, i), signature)
         _remember(thread, weld, state[i])
         _collect(thread, blocks, site_ids, jacobian, outputs[i])
-        if not np.isfinite(state[i]).all():
+        nv = jacobian.shape[1]
+        if not (_bounded(thread[_QVEL], nv) and _bounded(thread[_QACC], nv)):
             status[i] = DIVERGED
         for j in range(outputs.shape[1]):
             if not math.isfinite(outputs[i, j]):

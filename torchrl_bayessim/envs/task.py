@@ -1,9 +1,11 @@
 """What turns a MuJoCo model into a task: observation, reward, termination, reset, as functions.
 
 All functions act on a whole batch. They receive `Readings`: tensors by name, the outputs that the
-task asks the simulator for (arrays of ``MjData``, shape ``(*batch, *shape)``) and whatever its
-reset returned beside the state (a goal). Positions and forces that MuJoCo derives from the state
-are as old as in any program that calls ``mj_step``: of the start of the last time step.
+task asks the simulator for (arrays of ``MjData``, shape ``(*batch, *shape)``), whatever its reset
+returned beside the state (a goal), and ``dt``, the seconds per control step, which broadcasts to
+``batch`` and differs between environments whose physics set ``opt.timestep``. Positions and forces
+that MuJoCo derives from the state are as old as in any program that calls ``mj_step``: of the start
+of the last time step.
 """
 
 from __future__ import annotations
@@ -20,10 +22,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..errors import message
 from .draws import Draws
 from .drive import Drive
 
-Readings = SimpleNamespace
+
+class Readings(SimpleNamespace):
+    """Tensors by name; one that the task did not ask for is an error that says so."""
+
+    def __getattr__(self, name: str) -> Tensor:
+        expected = "something that the task reads"
+        hint = f"outputs=(…, {name!r}) in the Task"
+        raise AttributeError(message(expected, name, available=vars(self), hint=hint))
+
+
 Reset = Callable[[Draws], Mapping[str, NDArray[np.float64]]]
 
 
@@ -32,7 +44,7 @@ def _positions_and_velocities(now: Readings) -> Tensor:
 
 
 def _no_reward(_: Readings, after: Readings, action: Tensor) -> Tensor:  # noqa: ARG001
-    return after.qpos.new_zeros(after.qpos.shape[:-1])
+    return action.new_zeros(action.shape[:-1])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,8 +96,26 @@ class Task:
 
     @property
     def dt(self) -> float:
-        """Seconds per control step."""
+        """Seconds per control step in the nominal physics; ``readings.dt`` are those in force."""
         return self.model.opt.timestep * self.frame_skip
+
+    def verify(self, now: Readings, action: Tensor) -> None:
+        """Evaluate reward and termination once, to see whether they are as they should be.
+
+        Raises:
+            ValueError: One of them does not return one value per environment.
+        """
+        batch = action.shape[:-1]
+        values = {"reward": self.reward(now, now, action.double())}
+        if self.termination is not None:
+            values["termination"] = self.termination(now)
+        for name, value in values.items():
+            if value.shape != batch:
+                expected = f"a {name} of one value per environment, shape {tuple(batch)}"
+                hint = "index or reduce the last axis: now.qpos[..., 0]"
+                raise ValueError(message(expected, tuple(value.shape), hint=hint))
+        if self.termination is not None and values["termination"].dtype != torch.bool:
+            raise ValueError(message("a boolean termination", values["termination"].dtype))
 
 
 def uniform_reset(model: mujoco.MjModel, scale: float, *, velocity: str = "uniform") -> Reset:

@@ -58,10 +58,7 @@ def fetch(
     """
     model = robotics_model(f"fetch/{scene}.xml")
     initial, gripper, height = _arrange(model, base, block, lift)
-    dt = _FRAME_SKIP * model.opt.timestep
-
-    observe = _observer(model, dt, has_object=block is not None)
-
+    observe = _observer(model, has_object=block is not None)
     site = model.site("robot0:grip" if block is None else "object0").id
 
     def reward(_: Readings, after: Readings, action: Tensor) -> Tensor:  # noqa: ARG001
@@ -162,7 +159,7 @@ def _outputs(*, has_object: bool) -> tuple[str, ...]:
 
 
 def _observer(
-    model: mujoco.MjModel, dt: float, *, has_object: bool
+    model: mujoco.MjModel, *, has_object: bool
 ) -> Callable[[Readings], dict[str, Tensor]]:
     """Return the observation and goals as a function; velocities are per control step."""
     robot = [j for j in range(model.njnt) if model.joint(j).name.startswith("robot")]
@@ -171,7 +168,7 @@ def _observer(
     site = model.site("object0").id if has_object else hand
 
     def observe(now: Readings) -> dict[str, Tensor]:
-        read = vars(now)
+        read, dt = vars(now), now.dt[..., None]
         grip = now.site_xpos[..., hand, :]
         place = now.site_xpos[..., site, :]
         width = now.qpos[..., fingers]

@@ -20,12 +20,12 @@ from .assets import gymnasium_model
 
 
 def _forward_reward(
-    dt: float, control_cost: float, bonus: Callable[[Readings], Tensor] | float
+    control_cost: float, bonus: Callable[[Readings], Tensor] | float
 ) -> Callable[[Readings, Readings, Tensor], Tensor]:
     """Return ``ẋ + bonus - c ‖a‖²`` with ẋ the finite difference over a control step."""
 
     def reward(before: Readings, after: Readings, action: Tensor) -> Tensor:
-        speed = (after.qpos[..., 0] - before.qpos[..., 0]) / dt
+        speed = (after.qpos[..., 0] - before.qpos[..., 0]) / after.dt
         extra = bonus(after) if callable(bonus) else bonus
         return speed + extra - control_cost * action.square().sum(-1)
 
@@ -46,7 +46,7 @@ def _legged(model: mujoco.MjModel, healthy: Callable[[Readings], Tensor]) -> Tas
         model=model,
         frame_skip=4,
         observation=_planar_observation,
-        reward=_forward_reward(4 * model.opt.timestep, 1e-3, healthy),
+        reward=_forward_reward(1e-3, healthy),
         termination=lambda now: ~healthy(now),
         reset=uniform_reset(model, 5e-3),
         max_steps=1000,
@@ -83,7 +83,7 @@ def half_cheetah() -> Task:
         model=model,
         frame_skip=5,
         observation=lambda now: torch.cat([now.qpos[..., 1:], now.qvel], -1),
-        reward=_forward_reward(5 * model.opt.timestep, 0.1, 0.0),
+        reward=_forward_reward(0.1, 0.0),
         reset=uniform_reset(model, 0.1, velocity="normal"),
         max_steps=1000,
     )
@@ -96,7 +96,7 @@ def swimmer() -> Task:
         model=model,
         frame_skip=4,
         observation=lambda now: torch.cat([now.qpos[..., 2:], now.qvel], -1),
-        reward=_forward_reward(4 * model.opt.timestep, 1e-4, 0.0),
+        reward=_forward_reward(1e-4, 0.0),
         reset=uniform_reset(model, 0.1),
         max_steps=1000,
     )
@@ -105,7 +105,6 @@ def swimmer() -> Task:
 def ant() -> Task:
     """Ant-v5: four legs; contact forces are observed, clipped to [-1, 1], and cost."""
     model = gymnasium_model("ant.xml")
-    dt = 5 * model.opt.timestep
 
     def healthy(now: Readings) -> Tensor:
         height = now.qpos[..., 2]
@@ -116,7 +115,7 @@ def ant() -> Task:
         return torch.cat([now.qpos[..., 2:], now.qvel, forces], -1)
 
     def reward(before: Readings, after: Readings, action: Tensor) -> Tensor:
-        speed = (after.xpos[..., 1, 0] - before.xpos[..., 1, 0]) / dt
+        speed = (after.xpos[..., 1, 0] - before.xpos[..., 1, 0]) / after.dt
         contact = after.cfrc_ext.clamp(-1.0, 1.0).square().sum((-2, -1))
         return speed + healthy(after) - 0.5 * action.square().sum(-1) - 5e-4 * contact
 
@@ -136,7 +135,6 @@ def ant() -> Task:
 def humanoid() -> Task:
     """Humanoid-v5: it observes inertias, velocities and forces of its bodies too."""
     model = gymnasium_model("humanoid.xml")
-    dt = 5 * model.opt.timestep
 
     def healthy(now: Readings) -> Tensor:
         return _inside(now.qpos[..., 2], 1.0, 2.0)
@@ -155,7 +153,7 @@ def humanoid() -> Task:
         )
 
     def reward(before: Readings, after: Readings, action: Tensor) -> Tensor:
-        speed = (after.subtree_com[..., 0, 0] - before.subtree_com[..., 0, 0]) / dt
+        speed = (after.subtree_com[..., 0, 0] - before.subtree_com[..., 0, 0]) / after.dt
         contact = (5e-7 * after.cfrc_ext.square().sum((-2, -1))).clamp(max=10.0)
         return 1.25 * speed + 5.0 * healthy(after) - 0.1 * action.square().sum(-1) - contact
 
