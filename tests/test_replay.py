@@ -1,3 +1,5 @@
+import gymnasium
+import gymnasium_robotics
 import mujoco
 import numpy as np
 import pytest
@@ -79,6 +81,66 @@ def test_a_recorded_episode_is_replayed_exactly(name):
     np.testing.assert_array_equal(again["qpos"][0, :, -1], env.stepper["qpos"])
 
 
+@pytest.mark.parametrize("name", ["FetchReach-v4", "FetchPush-v4", "FetchPickAndPlace-v4"])
+def test_a_log_of_gymnasium_robotics_is_replayed_exactly(name):
+    """From the middle of an episode; ``weld_pose`` is as old as MjData's other poses."""
+    gymnasium.register_envs(gymnasium_robotics)
+    env = gymnasium.make(name).unwrapped
+    env.reset(seed=3)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        env.step(rng.uniform(-1, 1, 4).astype(np.float32))
+    data = env.data
+    hand = data.body("robot0:gripper_link")
+    start = {
+        "qpos": data.qpos,
+        "qvel": data.qvel,
+        "warmstart": data.qacc_warmstart,
+        "mocap_pos": data.mocap_pos.ravel(),
+        "mocap_quat": data.mocap_quat.ravel(),
+        "weld_pose": np.concatenate([hand.xpos, hand.xquat]),
+    }
+    segments = {key: torch.tensor(value)[None] for key, value in start.items()}
+    actions = rng.uniform(-1, 1, (1, 10, 4)).astype(np.float32)
+    log = []
+    for action in actions[0]:
+        env.step(action)
+        log.append(np.concatenate([data.qpos, data.qvel]))
+    y = replay(name, {**segments, "action": torch.from_numpy(actions)})
+    np.testing.assert_array_equal(torch.cat([y["qpos"], y["qvel"]], -1)[0, 0], np.stack(log))
+    del segments["weld_pose"]
+    with pytest.raises(ValueError, match=r"weld_pose.*Try: xpos and xquat of data.body\('robot0"):
+        replay(name, {**segments, "action": torch.from_numpy(actions)})
+
+
+def test_actions_may_have_been_held_for_another_time():
+    expected = replay(slider(frame_skip=2), pushes())
+    assert (replay(slider(), pushes(), dt=0.02)["qpos"] == expected["qpos"]).all()
+    for dt in (0.015, 0.001, -0.02):
+        with pytest.raises(ValueError, match=r"a multiple of the model's time step, 0.01 s"):
+            replay(slider(), pushes(), dt=dt)
+
+
+def test_speeds_in_a_replay_are_over_the_time_step_in_force():
+    env = BatchedMujocoEnv("FetchReach-v4", 2, dtype=torch.float64)
+    env.models.write("opt.timestep", (), np.array([0.001, 0.002]))
+    env.reset()
+    wanted = ("qpos", "qvel", "mocap_pos", "mocap_quat", "weld_pose", "warmstart", "time")
+    start = {name: torch.from_numpy(env.stepper[name][:1].copy()) for name in wanted}
+    start["goal"] = env.readings.goal[:1]
+    env.stepper.state[1] = env.stepper.state[0]
+    action = torch.full((1, 5, 4), 0.5)
+    recorded = env.open_loop(action.expand(2, 5, 4))["observation"]
+    model = Replay(
+        "FetchReach-v4",
+        {**start, "action": action},
+        physics=MujocoPhysics("opt.timestep"),
+        outputs=("observation",),
+    )
+    again = model(torch.tensor([[0.001], [0.002]], dtype=torch.float64))["observation"]
+    assert (again[:, 0] == recorded).all()
+
+
 def test_room_for_more_parameters_is_made_and_reused():
     segments, physics = pushes(), MujocoPhysics("dof_damping[x]")
     model = Replay(slider(), segments, physics=physics)
@@ -152,9 +214,10 @@ def test_a_divergence_stays_with_its_simulation():
     ("change", "error", "match"),
     [
         ({"qpos": torch.zeros(2, 1)}, ValueError, r"finite numbers for 3 segments in 'qpos'"),
-        ({"qpos": torch.zeros(3, 2)}, ValueError, r"qpos of shape \(3, 1\), got \(3, 2\)"),
+        ({"qpos": torch.zeros(3, 2)}, ValueError, r"shape \(3, 1\) for qpos, got \(3, 2\)"),
         ({"qvel": torch.full((3, 1), torch.nan)}, ValueError, "finite numbers .* 'qvel'"),
         ({"action": torch.zeros(3, 1)}, ValueError, r"actions of shape \(S, T, A\)"),
+        ({"action": torch.zeros(3, 0, 1)}, ValueError, r"T at least 1, got \(3, 0, 1\)"),
         ({"action": torch.zeros(3, 4, 2)}, ValueError, r"commands of shape \(B, T, 1\)"),
         ({"qpso": torch.zeros(3, 1)}, KeyError, r"qpos \(did you mean this\?\)"),
     ],
@@ -166,8 +229,10 @@ def test_bad_segments_are_refused(change, error, match):
 
 def test_bad_calls_are_refused():
     model = Replay(slider(), pushes(), physics=MujocoPhysics("dof_damping[x]"))
-    with pytest.raises(ValueError, match=r"theta of shape \(P, 1\) .*got \(2, 2\)"):
+    with pytest.raises(ValueError, match=r"theta of shape \(P, 1\), .*got \(2, 2\)"):
         model(torch.zeros(2, 2))
+    with pytest.raises(ValueError, match=r"P at least 1, .*got \(0, 1\)"):
+        model(torch.zeros(0, 1))
     with pytest.raises(ValueError, match="every='control', or 'time'"):
         model(hook=lambda now: {}, every="day")
     with pytest.raises(ValueError, match="segments with qpos, qvel and action"):

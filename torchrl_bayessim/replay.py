@@ -11,6 +11,7 @@ from __future__ import annotations
 __all__ = ["Hook", "Replay", "replay"]
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
+from .envs.components import finite_rows
 from .envs.draws import Draws
 from .envs.model_batch import ModelBatch
 from .envs.stepper import Stepper
@@ -57,16 +59,21 @@ class Replay:
     Args:
         task: A name or a `Task`; of a task, the model, ``frame_skip``, ``command``, ``drive`` and
             ``observation`` are used.
-        segments: ``action``, shape ``(S, T, A)``, each held for ``frame_skip`` steps, and the
-            components of the start states, shape ``(S, size)``: ``qpos``, ``qvel`` and where known
-            ``act``, ``time``, ``warmstart``, ``mocap_pos``, ``mocap_quat``, ``weld_pose``; the
-            others start at the model's defaults. A tensordict will do.
+        segments: ``action``, shape ``(S, T, A)``, each held for ``dt`` seconds, and the components
+            of the start states, shape ``(S, size)``: ``qpos``, ``qvel`` and where known ``act``,
+            ``time``, ``warmstart``, ``mocap_pos``, ``mocap_quat``; the others start at the model's
+            defaults. A tensordict will do. Fetch also needs ``weld_pose``, from which the next
+            action moves the hand: ``xpos`` and ``xquat`` of ``robot0:gripper_link``, as they stood
+            in ``MjData`` when the start state was recorded.
         physics: What the columns of theta set; default nothing.
         outputs: Arrays of ``MjData`` to return, and ``observation`` for the task's observation.
         threads: Threads to step with; default all cores that this process may use.
+        dt: Seconds for which the recorded actions were held, a multiple of the model's nominal time
+            step; default the task's.
 
     Raises:
-        ValueError: The segments disagree in number, lack positions or actions, or are not finite.
+        ValueError: The segments disagree in number, lack what they need, or are not finite;
+            ``dt`` is not a multiple of the time step.
 
     Attributes:
         task: The task.
@@ -83,15 +90,18 @@ class Replay:
         physics: Physics | None = None,
         outputs: tuple[str, ...] = ("qpos", "qvel"),
         threads: int | None = None,
+        dt: float | None = None,
     ) -> None:
         self.task = known_task(task) if isinstance(task, str) else task
+        if dt is not None:
+            self.task = replace(self.task, frame_skip=_substeps(self.task, dt))
         self.physics = physics
         self._names = outputs
         read = tuple(name for name in outputs if name != "observation")
         if "observation" in outputs:
             read += tuple(name for name in self.task.outputs if name not in read)
         given = {key: torch.as_tensor(segments[key]).double() for key in segments.keys()}  # noqa: SIM118
-        action = _checked(given)
+        action = _checked(given, self.task)
         self.num_segments, self.steps = action.shape[:2]
         # commands in the precision of the actions, as in an environment
         action = torch.as_tensor(segments["action"])
@@ -108,7 +118,6 @@ class Replay:
         self._starts = np.tile(self._stepper.initial, (self.num_segments, 1))
         self._extras: dict[str, Tensor] = {}
         self._place(given)
-        self._poses_unknown = self.task.drive.weld is not None and "weld_pose" not in given
 
     @property
     def models(self) -> ModelBatch:
@@ -141,8 +150,6 @@ class Replay:
         rows = np.arange(count * self.num_segments)
         stepper = self._stepper
         stepper.state.reshape(-1, *self._starts.shape)[:count] = self._starts
-        if self._poses_unknown:
-            stepper.begin(rows)
         outputs = np.empty((len(rows), self.steps, stepper.output_size))
         if hook is not None:
             self._hooked(hook, every, rows, outputs)
@@ -155,9 +162,9 @@ class Replay:
         return self._collect(outputs.reshape(count, self.num_segments, self.steps, -1))
 
     def _write(self, theta: Tensor) -> int:
-        if self.physics is None or theta.ndim != 2 or theta.shape[1] != len(self.physics.names):
-            names = () if self.physics is None else self.physics.names
-            expected = f"theta of shape (P, {len(names)}) for the parameters {names}"
+        names = () if self.physics is None else self.physics.names
+        if self.physics is None or theta.ndim != 2 or theta.shape != (len(theta) or 1, len(names)):
+            expected = f"theta of shape (P, {len(names)}), P at least 1, for the parameters {names}"
             raise ValueError(message(expected, tuple(theta.shape), hint="pass physics"))
         count = len(theta)
         if count > self.models.num_envs:
@@ -209,11 +216,9 @@ class Replay:
         own = {} if reset is None else reset(Draws(0, np.zeros(1, int), np.zeros(1, int)))
         for name, value in {**self.task.initial, **given}.items():
             if name in components:
-                if value.shape[1:] != self._starts[:, components[name]].shape[1:]:
-                    size = self._starts[:, components[name]].shape[1]
-                    expected = f"{name} of shape ({self.num_segments}, {size})"
-                    raise ValueError(message(expected, tuple(value.shape)))
-                self._starts[:, components[name]] = value
+                part = self._starts[:, components[name]]
+                rows = np.broadcast_to(value, part.shape) if name not in given else value
+                part[:] = finite_rows(name, rows, part.shape)
             elif name in own:
                 self._extras[name] = torch.as_tensor(value).unsqueeze(1)
             elif name != "action":
@@ -225,7 +230,9 @@ class Replay:
         read = {name: torch.from_numpy(view(outputs, name)) for name in self._stepper.layout}
         result = {name: read[name] for name in self._names if name != "observation"}
         if "observation" in self._names:
-            observed = self.task.observation(Readings(**read, **self._extras))
+            step = self.models.read("opt.timestep", ())[: len(outputs)] * self.task.frame_skip
+            dt = torch.from_numpy(step)[:, None, None]
+            observed = self.task.observation(Readings(**read, **self._extras, dt=dt))
             result |= observed if isinstance(observed, dict) else {"observation": observed}
         return TensorDict(result, batch_size=outputs.shape[:3])
 
@@ -238,6 +245,7 @@ def replay(
     physics: Physics | None = None,
     outputs: tuple[str, ...] = ("qpos", "qvel"),
     hook: Hook | None = None,
+    dt: float | None = None,
 ) -> TensorDict:
     """Simulate segments once under every parameter vector; see `Replay` for the arguments.
 
@@ -247,17 +255,33 @@ def replay(
         >>> bool((y["qpos"][0, 0, :, 0].diff() > 0).all())  # the cart goes the way it is pushed
         True
     """
-    return Replay(task, segments, physics=physics, outputs=outputs)(theta, hook=hook)
+    return Replay(task, segments, physics=physics, outputs=outputs, dt=dt)(theta, hook=hook)
 
 
-def _checked(given: Mapping[str, Tensor]) -> Tensor:
+def _substeps(task: Task, dt: float) -> int:
+    """Return how many time steps of the model are ``dt`` seconds."""
+    timestep = task.model.opt.timestep
+    count = round(dt / timestep)
+    if count < 1 or abs(count * timestep - dt) > 1e-6 * dt:
+        expected = f"dt to be a multiple of the model's time step, {timestep:g} s"
+        hint = f"{max(1, count) * timestep:g}, or a model of another time step"
+        raise ValueError(message(expected, dt, hint=hint))
+    return count
+
+
+def _checked(given: Mapping[str, Tensor], task: Task) -> Tensor:
     """Return the actions of segments that are fit to be replayed."""
-    missing = [name for name in ("qpos", "qvel", "action") if name not in given]
-    if missing:
+    needed = {"qpos", "qvel", "action"}
+    if not needed <= given.keys():
         raise ValueError(message("segments with qpos, qvel and action", sorted(given)))
+    if task.drive.weld is not None and "weld_pose" not in given:
+        expected = "segments with weld_pose, from which the next action steps"
+        hint = f"xpos and xquat of data.body({task.drive.weld!r}), as recorded with qpos"
+        raise ValueError(message(expected, sorted(given), hint=hint))
     action = given["action"]
-    if action.ndim != 3:
-        raise ValueError(message("actions of shape (S, T, A)", tuple(action.shape)))
+    if action.ndim != 3 or not all(action.shape[:2]):
+        expected = "actions of shape (S, T, A), S and T at least 1"
+        raise ValueError(message(expected, tuple(action.shape)))
     for name, value in given.items():
         if len(value) != len(action) or not value.isfinite().all():
             expected = f"finite numbers for {len(action)} segments in {name!r}"
