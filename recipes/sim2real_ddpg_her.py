@@ -19,25 +19,24 @@ from pathlib import Path
 from typing import Any
 
 import recipe
-import torch
 from fetch_tasks import FETCH, MEASURED, GoalTask, paper
+from rounds import Journal, compare, describe, draw_pictures, sentence, shown
 from scipy.stats import binomtest
-from sim2real_ppo import Journal, confidence
 from tasks import true_parameters
 from torch import Tensor
-from training import Plan, Trained, scored, single_thread, train
+from training import Plan, Trained, single_thread, train
 from video import record
 
-from torchrl_bayessim import plots
+from torchrl_bayessim import checkpoint
 from torchrl_bayessim.agents.ddpg import DDPG
 from torchrl_bayessim.errors import message
 from torchrl_bayessim.evaluation import successes
 from torchrl_bayessim.inference.refinement import PosteriorRefinement
 from torchrl_bayessim.influence import check_influence
-from torchrl_bayessim.loop import Round, SimToRealLoop
+from torchrl_bayessim.loop import SimToRealLoop
 from torchrl_bayessim.randomness import isolated, seed_from
 from torchrl_bayessim.robots import SurrogateRobot
-from torchrl_bayessim.sources import Grid, draw
+from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.summaries import SummaryStatistics
 from torchrl_bayessim.transforms import DomainRandomizer
 
@@ -76,36 +75,33 @@ def job(settings: Sim2RealFetch, out: Path) -> dict[str, Any]:
     run = Run(task, truth, settings, out)
     print(f"{settings.task}: {run.learner.name}, {task.prior}")
     resumed = run.loop.resume() if settings.resume else False
-    collecting = None if resumed else run.collect()  # the loop's checkpoint goes on from it
-    journal = Journal(out / "rounds.json", resume=resumed)
-    for turn in run.loop:
-        reached = score(run.learner.policy)
-        journal.add(turn.index, describe(turn, task, truth, reached))
-        print(sentence(turn, task, journal.rounds[-1]))
-    after = {"posterior": score(run.learner.policy)}
+    if not resumed:  # otherwise the loop's checkpoint goes on from it
+        run.hand_over()
+    rounds = run.rounds(score, Journal(out / "rounds.json", resume=resumed))
+    posterior = run.loop.refinement.posterior
+    assert posterior is not None  # every round refines it
+    after = score(run.learner.policy)
     result: dict[str, Any] = {
         "task": settings.task,
         "algorithm": run.learner.name,
         "parameters": list(task.prior.names),
         "true": truth.tolist(),
-        "rounds": [{k: v for k, v in entry.items() if k != "curve"} for entry in journal.rounds],
-        "collecting_frames": task.warmup * task.environments * task.horizon,
+        "rounds": [{k: v for k, v in entry.items() if k != "curve"} for entry in rounds],
+        "collecting_frames": run.collecting_frames,
         "success_under_prior": {"posterior": report(under_prior(run.learner.policy))},
         "checkpoint": out / "checkpoint.pt",
     }
-    curves = {"posterior": [point for entry in journal.rounds for point in entry["curve"]]}
-    posterior = run.loop.refinement.posterior
+    curves = {"posterior": [point for entry in rounds for point in entry["curve"]]}
     if settings.video:
         result["video"] = record(task, run.learner.policy, truth, out / "posterior.gif")
     if settings.baseline:
         curves["prior"] = run.go_on_under_prior().curve
-        after["prior"] = score(run.learner.policy)
-        result |= compare(after["posterior"], after["prior"])
+        baseline = score(run.learner.policy)
+        result |= compare(after, baseline, real=share(baseline))
         result["success_under_prior"]["prior"] = report(under_prior(run.learner.policy))
-    assert posterior is not None  # every round refines it
-    if collecting is not None:
-        curves["collecting"] = collecting.curve
-    draw_pictures(out, task, posterior, result=result, curves=curves)
+        told = shown(*share(baseline), digits=2)
+        print(f"prior only: {told} of goals reached after as many frames")
+    draw_pictures(out, task, posterior, result=result, curves=run.joined(curves), score="success")
     print(f"Pictures and numbers are in {out}")
     return result
 
@@ -162,7 +158,8 @@ class Run:
 
     def __init__(self, task: GoalTask, truth: Tensor, settings: Sim2RealFetch, out: Path) -> None:
         seed = settings.seed
-        self.task, self.settings, self.out = task, settings, out
+        self.task, self.truth, self.settings, self.out = task, truth, settings, out
+        self.collecting_frames = task.warmup * task.environments * task.horizon
         self.randomizer = DomainRandomizer(task.prior, seed=seed)
         self.env = task.make(task.environments, seed=seed, randomizer=self.randomizer)
         check_influence(self.env, self.randomizer, task.prior, steps=task.max_steps)
@@ -192,12 +189,45 @@ class Run:
             progress=settings.progress,
         )
 
+    def hand_over(self) -> None:
+        """Train the data-collecting policy, from which the loop goes on, and forget its episodes.
+
+        They ran under the prior: kept, they would be half of what is replayed until the end, and
+        the critic would value actions under their physics too. What the policy simulates for
+        inference, before it learns anew, is then the first in the replay buffer; going on from no
+        more than that is enough (Zhou et al. 2024, https://arxiv.org/abs/2412.07762).
+        """
+        self.collect()
+        self.learner.buffer.empty()
+
+    def rounds(self, score: GoalScore, journal: Journal) -> list[dict[str, Any]]:
+        """Go through the rounds that are left; return the entries of all."""
+        for turn in self.loop:
+            real = share(score(self.learner.policy))
+            journal.add(turn.index, describe(turn, self.task, self.truth, real=real))
+            said = f"the robot reaches {shown(*real, digits=2)} of its goals"
+            print(sentence(turn, self.task, journal.rounds[-1], said=said))
+        return journal.rounds
+
     def collect(self) -> Trained:
         """Train the data-collecting policy under the prior; all else starts from it."""
         return self._train("collecting", self.task.warmup, decays=False)
 
+    def joined(self, curves: dict[str, list[Any]]) -> dict[str, list[Any]]:
+        """Return the learning curves after that of the policy from which they start."""
+        first = checkpoint.load(self.out / "collecting.pt")["curve"]
+        before = self.collecting_frames
+        later = {
+            name: [{**point, "frames": before + point["frames"]} for point in curve]
+            for name, curve in curves.items()
+        }
+        return {**later, "prior, collecting": first}
+
     def go_on_under_prior(self) -> Trained:
-        """Train the collecting policy under the prior for as many frames as the loop did."""
+        """Train the collecting policy under the prior for as many frames as the loop did.
+
+        Its episodes stay in the replay buffer: they are of the same prior.
+        """
         self.collect()  # which is in its checkpoint
         frames = self.loop.planned_frames
         batches = frames // (self.task.environments * self.task.horizon)
@@ -221,100 +251,16 @@ class Run:
         )
 
 
+def share(reached: Tensor) -> tuple[float, list[float]]:
+    """Return the share of successes and its 95 % interval (Wilson 1927)."""
+    low, high = binomtest(int(reached.sum()), len(reached)).proportion_ci(method="wilson")
+    return reached.mean().item(), [low, high]
+
+
 def report(reached: Tensor) -> dict[str, Any]:
-    """Return the share of successes with its 95 % interval (Wilson 1927)."""
-    found = binomtest(int(reached.sum()), len(reached))
-    low, high = found.proportion_ci(method="wilson")
-    return {"mean": reached.mean().item(), "ci": [low, high], "episodes": len(reached)}
-
-
-def compare(posterior: Tensor, prior: Tensor) -> dict[str, Any]:
-    """Return the baseline's entries of result.json; episodes are paired by their start and goal."""
-    found = report(prior)
-    gain, gain_interval = confidence(posterior - prior)
-    mean, interval = found["mean"], found["ci"]
-    print(f"prior only: {mean:.2f} {shown(interval)} of goals reached after as many frames")
-    return {
-        "baseline": {"source": "prior", "real_return": mean, "real_return_ci": interval},
-        "gain": {"real_return": gain, "real_return_ci": gain_interval},
-    }
-
-
-def shown(interval: list[float]) -> str:
-    """Return an interval of shares as text."""
-    return f"[{interval[0]:.2f}, {interval[1]:.2f}]"
-
-
-def describe(turn: Round, task: GoalTask, truth: Tensor, reached: Tensor) -> dict[str, Any]:
-    """Return the round's entry of result.json; ``real_return`` is the share of goals reached."""
-    log_prob = turn.posterior.log_prob(truth).item()
-    found = report(reached)
-    trained = [point["return"] for point in turn.curve]
-    return {
-        "round": turn.index + 1,
-        "posterior_mean": turn.posterior.mean.tolist(),
-        "posterior_sd": turn.posterior.stddev.tolist(),
-        "log_prob_true": log_prob,
-        "nats_over_prior": log_prob - task.prior.log_prob(truth).item(),
-        "real_return": found["mean"],
-        "real_return_ci": found["ci"],
-        "sim_return": trained[-1] if trained else None,
-        "frames": turn.frames,
-        "simulations": turn.simulations,
-        "seconds": turn.seconds,
-        "curve": turn.curve,
-    }
-
-
-def sentence(turn: Round, task: GoalTask, entry: dict[str, Any]) -> str:
-    """Return the round in one line."""
-    name, unit = task.prior.names[0], task.prior.units[0]
-    mean, sd = entry["posterior_mean"][0], entry["posterior_sd"][0]
-    return (
-        f"round {turn.index + 1}: {name} {mean:.3g} ± {sd:.2g} {unit}".rstrip()
-        + f" ({entry['nats_over_prior']:+.1f} nats over the prior); the robot reaches "
-        f"{entry['real_return']:.2f} {shown(entry['real_return_ci'])} of its goals after "
-        f"{turn.frames:,} frames, {turn.seconds:.0f} s"
-    )
-
-
-def draw_pictures(
-    out: Path,
-    task: GoalTask,
-    posterior: Any,
-    *,
-    result: dict[str, Any],
-    curves: dict[str, list[dict[str, float]]],
-) -> None:
-    """Write posterior.png, learning.png and return.png."""
-    figure = plots.pair_plot(
-        draw(posterior, 4000, key=("picture",)),
-        names=task.prior.names,
-        units=task.prior.units,
-        prior_samples=draw(task.prior, 4000, key=("picture", "prior")),
-        truth=torch.tensor(result["true"]),
-    )
-    figure.savefig(out / "posterior.png", dpi=150)
-    lines = {
-        f"{name} policy": (
-            torch.tensor([point["frames"] for point in scored(curve)]),
-            torch.tensor([point["score"] for point in scored(curve)]),
-        )
-        for name, curve in curves.items()
-        if scored(curve)
-    }
-    if lines:
-        figure = plots.learning_curves(lines, ylabel="success under the prior, 64 episodes")
-        figure.savefig(out / "learning.png", dpi=150)
-    baseline = result.get("baseline", {})
-    figure = plots.return_per_round(
-        [entry["real_return"] for entry in result["rounds"]],
-        [tuple(entry["real_return_ci"]) for entry in result["rounds"]],
-        baseline=baseline.get("real_return"),
-        baseline_interval=tuple(baseline["real_return_ci"]) if baseline else None,
-        ylabel="success at the real system",
-    )
-    figure.savefig(out / "return.png", dpi=150)
+    """Return the same as an entry of result.json."""
+    mean, interval = share(reached)
+    return {"mean": mean, "ci": interval, "episodes": len(reached)}
 
 
 if __name__ == "__main__":

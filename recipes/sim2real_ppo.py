@@ -11,7 +11,6 @@ pictures, learning curves and a checkpoint; ``resume=FOLDER`` goes on after a br
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import os
 import threading
@@ -23,21 +22,20 @@ from typing import Any
 
 import recipe
 import torch
+from rounds import Journal, compare, confidence, describe, draw_pictures, sentence, shown
 from tasks import TASKS, Task, true_parameters
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.record.loggers import get_logger
 
-from torchrl_bayessim import plots
 from torchrl_bayessim.agents.ppo import PPO
 from torchrl_bayessim.errors import message
 from torchrl_bayessim.evaluation import evaluate
-from torchrl_bayessim.inference.physics_posterior import PhysicsPosterior
 from torchrl_bayessim.inference.refinement import PosteriorRefinement
-from torchrl_bayessim.loop import Round, SimToRealLoop, ended_return
+from torchrl_bayessim.loop import SimToRealLoop, ended_return
 from torchrl_bayessim.randomness import isolated
 from torchrl_bayessim.robots import SurrogateRobot
-from torchrl_bayessim.sources import Grid, draw
+from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.summaries import SummaryStatistics
 from torchrl_bayessim.transforms import DomainRandomizer
 
@@ -77,11 +75,13 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
     print(f"{settings.task}: {task.prior}")
     with Baseline(settings, frames=loop.planned_frames) as baseline:
         for turn in loop:
-            done.add(turn.index, describe(turn, task, truth, score(learner.policy)))
+            earned = confidence(score(learner.policy))
+            done.add(turn.index, describe(turn, task, truth, real=earned))
             for entry in turn.curve:
                 for name, value in entry.items():
                     logger.log_scalar(f"train/{name}", value, step=int(entry["frames"]))
-            print(sentence(turn, task, done.rounds[-1]))
+            said = f"the robot earns {shown(*earned)}"
+            print(sentence(turn, task, done.rounds[-1], said=said))
         result: dict[str, Any] = {
             "task": settings.task,
             "parameters": list(task.prior.names),
@@ -94,10 +94,13 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
             returns = score(learner.policy)
             weights, curves["prior"] = baseline.result()
             learner.policy.load_state_dict(weights)
-            result |= compare(returns, score(learner.policy))
+            baseline_returns = score(learner.policy)
+            earned = confidence(baseline_returns)
+            result |= compare(returns, baseline_returns, real=earned)
+            print(f"prior only: the robot earns {shown(*earned)} after as many frames")
     posterior = loop.refinement.posterior
     assert posterior is not None  # every round refines it
-    draw_pictures(out, task, posterior, result=result, curves=curves)
+    draw_pictures(out, task, posterior, result=result, curves=curves, score="return")
     print(f"Pictures and numbers are in {out}")
     return result
 
@@ -111,17 +114,6 @@ def chosen(settings: Sim2Real) -> Task:
         ppo = {**task.ppo, "epochs": 2, "minibatch_size": 1024}
         task = dataclasses.replace(task, shared_batches=1, ppo=ppo)
     return task
-
-
-def compare(returns: Tensor, baseline: Tensor) -> dict[str, Any]:
-    """Return the baseline's entries of result.json; episodes are paired by their initial state."""
-    mean, interval = confidence(baseline)
-    gain, gain_interval = confidence(returns - baseline)
-    print(f"prior only: the robot earns {mean:.1f} {shown(interval)} after as many frames")
-    return {
-        "baseline": {"source": "prior", "real_return": mean, "real_return_ci": interval},
-        "gain": {"real_return": gain, "real_return_ci": gain_interval},
-    }
 
 
 def make_loop(
@@ -171,20 +163,6 @@ class Score:
         self.env.set_seed(1_000_003)
         with isolated("score"):
             return evaluate(self.env, policy, max_steps=self.max_steps)
-
-
-class Journal:
-    """What each round gave, kept beside the checkpoint so that a resumed run reports them all."""
-
-    def __init__(self, path: Path, *, resume: bool) -> None:
-        self.path = path
-        resume = resume and path.exists()  # not before the end of the first round
-        self.rounds: list[dict[str, Any]] = json.loads(path.read_text()) if resume else []
-
-    def add(self, index: int, entry: dict[str, Any]) -> None:
-        """Keep the entry of round ``index``, which may be told twice after a break."""
-        self.rounds = [*self.rounds[:index], entry]
-        recipe.write(self.path, json.dumps(recipe.plain(self.rounds)))
 
 
 class Baseline:
@@ -248,104 +226,6 @@ def train_under_prior(
         curve.append({"frames": frames_so_far, "return": ended_return(batch), **reported})
     collector.shutdown()
     return dict(learner.policy.state_dict()), curve
-
-
-def describe(turn: Round, task: Task, truth: Tensor, returns: Tensor) -> dict[str, Any]:
-    """Return the round's entry of result.json."""
-    posterior = turn.posterior
-    log_prob = posterior.log_prob(truth).item()
-    mean, interval = confidence(returns)
-    trained = [point["return"] for point in turn.curve if math.isfinite(point["return"])]
-    return {
-        "round": turn.index + 1,
-        "posterior_mean": posterior.mean.tolist(),
-        "posterior_sd": posterior.stddev.tolist(),
-        "log_prob_true": log_prob,
-        "nats_over_prior": log_prob - task.prior.log_prob(truth).item(),
-        "real_return": mean,
-        "real_return_ci": interval,
-        "sim_return": trained[-1] if trained else None,
-        "frames": turn.frames,
-        "simulations": turn.simulations,
-        "seconds": turn.seconds,
-        "curve": turn.curve,
-    }
-
-
-def confidence(values: Tensor) -> tuple[float, list[float]]:
-    """Return mean and 95 % interval of the mean."""
-    mean = values.mean().item()
-    half = 1.96 * values.std().item() / math.sqrt(len(values))
-    return mean, [mean - half, mean + half]
-
-
-def shown(interval: list[float]) -> str:
-    """Return an interval as text."""
-    return f"[{interval[0]:.1f}, {interval[1]:.1f}]"
-
-
-def sentence(turn: Round, task: Task, entry: dict[str, Any]) -> str:
-    """Return the round in one line."""
-    rows = zip(
-        task.prior.names,
-        entry["posterior_mean"],
-        entry["posterior_sd"],
-        task.prior.units,
-        strict=True,
-    )
-    physics = ", ".join(f"{n} {m:.3g} ± {s:.2g} {u}".rstrip() for n, m, s, u in rows)
-    return (
-        f"round {turn.index + 1}: {physics} ({entry['nats_over_prior']:+.1f} nats over the prior); "
-        f"the robot earns {entry['real_return']:.1f} {shown(entry['real_return_ci'])} "
-        f"after {turn.frames:,} frames, {turn.seconds:.0f} s"
-    )
-
-
-def draw_pictures(
-    out: Path,
-    task: Task,
-    posterior: PhysicsPosterior,
-    *,
-    result: dict[str, Any],
-    curves: dict[str, list[dict[str, float]]],
-) -> None:
-    """Write posterior.png (also zoomed), learning.png and return.png."""
-    samples = draw(posterior, 4000, key=("picture",))
-    prior_samples = draw(task.prior, 4000, key=("picture", "prior"))
-    for name, zoom in {"posterior": False, "posterior_zoom": True}.items():
-        figure = plots.pair_plot(
-            samples,
-            names=task.prior.names,
-            units=task.prior.units,
-            prior_samples=prior_samples,
-            truth=torch.tensor(result["true"]),
-            zoom=zoom,
-        )
-        figure.savefig(out / f"{name}.png", dpi=150)
-    lines = {
-        f"trained under the {name}": (
-            torch.tensor([point["frames"] for point in curve if ended(point)]),
-            torch.tensor([point["return"] for point in curve if ended(point)]),
-        )
-        for name, curve in curves.items()
-        if any(ended(point) for point in curve)
-    }
-    if lines:
-        figure = plots.learning_curves(lines, ylabel="return of finished episodes in simulation")
-        figure.savefig(out / "learning.png", dpi=150)
-    baseline = result.get("baseline", {})
-    figure = plots.return_per_round(
-        [entry["real_return"] for entry in result["rounds"]],
-        [tuple(entry["real_return_ci"]) for entry in result["rounds"]],
-        baseline=baseline.get("real_return"),
-        baseline_interval=tuple(baseline["real_return_ci"]) if baseline else None,
-    )
-    figure.savefig(out / "return.png", dpi=150)
-
-
-def ended(point: dict[str, float]) -> bool:
-    """Return whether an episode ended in this point's batch."""
-    return point["return"] is not None and math.isfinite(point["return"])
 
 
 if __name__ == "__main__":

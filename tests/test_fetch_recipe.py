@@ -57,10 +57,35 @@ def test_the_result_has_what_others_read(finished):
     assert result["gain"].keys() == {"real_return", "real_return_ci"}
 
 
+def test_the_loop_forgets_what_was_collected_under_the_prior(finished):
+    from torchrl_bayessim.checkpoint import load
+
+    frames = json.loads((finished / "result.json").read_text())["rounds"][-1]["frames"]
+    replayed = {
+        name: len(load(finished / f"{name}.pt")["learner"]["buffer"]["entries"]["action"])
+        for name in ("collecting", "checkpoint", "prior")
+    }
+    assert replayed["collecting"] == 2 * 8 * 50
+    assert replayed["checkpoint"] == frames
+    assert replayed["prior"] == replayed["collecting"] + frames  # the same prior: kept
+
+
+def test_learning_curves_go_on_where_the_collecting_policy_ends(finished, recipes):
+    from sim2real_ddpg_her import Run, Sim2RealFetch, chosen
+    from torch import tensor
+
+    task = chosen(Sim2RealFetch(task="fetch_reach", short=True))
+    run = Run(task, tensor([50.0]), Sim2RealFetch(short=True), finished)
+    kept = json.loads((finished / "rounds.json").read_text())
+    curves = run.joined({"posterior": kept[-1]["curve"]})
+    assert [point["frames"] for point in curves["prior, collecting"]] == [400, 800]
+    assert [point["frames"] for point in curves["posterior"]] == [1200, 1600, 2000]
+
+
 def test_pictures_and_the_film_are_drawn(finished):
     from matplotlib.image import imread
 
-    for name in ("posterior", "return"):
+    for name in ("posterior", "posterior_zoom", "learning", "return"):
         assert imread(finished / f"{name}.png")[..., :3].std() > 0.01
     film = json.loads((finished / "result.json").read_text())["video"]
     if film is None:

@@ -1,0 +1,145 @@
+"""What the rounds of a `sim2real` job gave: entries of result.json, the journal, the pictures."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import recipe
+import torch
+from tasks import Task
+from torch import Tensor
+
+from torchrl_bayessim import plots
+from torchrl_bayessim.inference.physics_posterior import PhysicsPosterior
+from torchrl_bayessim.loop import Round
+from torchrl_bayessim.sources import draw
+
+
+class Journal:
+    """What each round gave, kept beside the checkpoint so that a resumed run reports them all."""
+
+    def __init__(self, path: Path, *, resume: bool) -> None:
+        self.path = path
+        resume = resume and path.exists()  # not before the end of the first round
+        self.rounds: list[dict[str, Any]] = json.loads(path.read_text()) if resume else []
+
+    def add(self, index: int, entry: dict[str, Any]) -> None:
+        """Keep the entry of round ``index``, which may be told twice after a break."""
+        self.rounds = [*self.rounds[:index], entry]
+        recipe.write(self.path, json.dumps(recipe.plain(self.rounds)))
+
+
+def describe(
+    turn: Round, task: Task, truth: Tensor, *, real: tuple[float, list[float]]
+) -> dict[str, Any]:
+    """Return the round's entry of result.json; ``real`` is the robot's score with its interval."""
+    log_prob = turn.posterior.log_prob(truth).item()
+    trained = [point["return"] for point in turn.curve if ended(point)]
+    return {
+        "round": turn.index + 1,
+        "posterior_mean": turn.posterior.mean.tolist(),
+        "posterior_sd": turn.posterior.stddev.tolist(),
+        "log_prob_true": log_prob,
+        "nats_over_prior": log_prob - task.prior.log_prob(truth).item(),
+        "real_return": real[0],
+        "real_return_ci": real[1],
+        "sim_return": trained[-1] if trained else None,
+        "frames": turn.frames,
+        "simulations": turn.simulations,
+        "seconds": turn.seconds,
+        "curve": turn.curve,
+    }
+
+
+def compare(posterior: Tensor, prior: Tensor, *, real: tuple[float, list[float]]) -> dict[str, Any]:
+    """Return the entries of the baseline, whose score is ``real``; episodes are paired."""
+    gain, interval = confidence(posterior - prior)
+    return {
+        "baseline": {"source": "prior", "real_return": real[0], "real_return_ci": real[1]},
+        "gain": {"real_return": gain, "real_return_ci": interval},
+    }
+
+
+def confidence(values: Tensor) -> tuple[float, list[float]]:
+    """Return mean and 95 % interval of the mean."""
+    mean = values.mean().item()
+    half = 1.96 * values.std().item() / math.sqrt(len(values))
+    return mean, [mean - half, mean + half]
+
+
+def shown(mean: float, interval: list[float], *, digits: int = 1) -> str:
+    """Return a score and its interval as text."""
+    low, high = (f"{bound:.{digits}f}" for bound in interval)
+    return f"{mean:.{digits}f} [{low}, {high}]"
+
+
+def sentence(turn: Round, task: Task, entry: dict[str, Any], *, said: str) -> str:
+    """Return the round in one line, with what is ``said`` of the robot."""
+    moments = entry["posterior_mean"], entry["posterior_sd"]
+    rows = zip(task.prior.names, *moments, task.prior.units, strict=True)
+    physics = ", ".join(f"{n} {m:.3g} ± {s:.2g} {u}".rstrip() for n, m, s, u in rows)
+    return (
+        f"round {turn.index + 1}: {physics} ({entry['nats_over_prior']:+.1f} nats over the prior); "
+        f"{said} after {turn.frames:,} frames, {turn.seconds:.0f} s"
+    )
+
+
+def draw_pictures(
+    out: Path,
+    task: Task,
+    posterior: PhysicsPosterior,
+    *,
+    result: dict[str, Any],
+    curves: dict[str, list[dict[str, float]]],
+    score: str,
+) -> None:
+    """Write posterior.png (also zoomed), learning.png and return.png.
+
+    Args:
+        out: Folder.
+        task: Whose parameters these are.
+        posterior: Of the last round.
+        result: Holds the truth, the rounds and, if there is one, the baseline.
+        curves: What a policy was trained under, to its points with ``frames`` and ``return``.
+        score: What the robot gives.
+    """
+    samples = draw(posterior, 4000, key=("picture",))
+    prior_samples = draw(task.prior, 4000, key=("picture", "prior"))
+    for name, zoom in {"posterior": False, "posterior_zoom": True}.items():
+        figure = plots.pair_plot(
+            samples,
+            names=task.prior.names,
+            units=task.prior.units,
+            prior_samples=prior_samples,
+            truth=torch.tensor(result["true"]),
+            zoom=zoom,
+        )
+        figure.savefig(out / f"{name}.png", dpi=150)
+    lines = {
+        f"under the {name}": (
+            torch.tensor([point["frames"] for point in curve if ended(point)]),
+            torch.tensor([point["return"] for point in curve if ended(point)]),
+        )
+        for name, curve in curves.items()
+        if any(ended(point) for point in curve)
+    }
+    if lines:
+        figure = plots.learning_curves(lines, ylabel="return of finished episodes in simulation")
+        figure.savefig(out / "learning.png", dpi=150)
+    baseline = result.get("baseline", {})
+    figure = plots.return_per_round(
+        [entry["real_return"] for entry in result["rounds"]],
+        [tuple(entry["real_return_ci"]) for entry in result["rounds"]],
+        baseline=baseline.get("real_return"),
+        baseline_interval=tuple(baseline["real_return_ci"]) if baseline else None,
+        ylabel=f"{score} at the real system",
+    )
+    figure.savefig(out / "return.png", dpi=150)
+
+
+def ended(point: dict[str, float]) -> bool:
+    """Return whether an episode ended in this point's batch."""
+    return point["return"] is not None and math.isfinite(point["return"])
