@@ -35,10 +35,15 @@ def curves(runs: list[dict[str, Any]], parameters: list[str]) -> list[dict[str, 
     return found
 
 
-def at_real(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return each source's scores at the robot, and the posterior's differences by seed."""
+def compared(runs: list[dict[str, Any]], where: str) -> dict[str, Any]:
+    """Return each source's scores, and the posterior's differences by seed.
+
+    Args:
+        runs: One per seed and source.
+        where: ``at_real``, at the robot, or ``under_prior``.
+    """
     scores = {
-        source: [run["at_real"] for run in runs if run["source"] == source]
+        source: [run[where] for run in runs if run["source"] == source]
         for source in dict.fromkeys(run["source"] for run in runs)
     }
     found: dict[str, Any] = {source: _spread(values) for source, values in scores.items()}
@@ -65,16 +70,17 @@ def table(result: dict[str, Any]) -> str:
         f"({', '.join(f'{n} {v:.3g}' for n, v in _truth(result))})",
         "",
         f"| trained under | {score} at the robot, mean and 95 % interval over seeds | spread (sd) "
-        "| each seed | its own physics first solved after (frames) |",
-        "|---|---|---|---|---|",
+        f"| each seed | {score} under the prior | its own physics first solved after (frames) |",
+        "|---|---|---|---|---|---|",
     ]
     for source, entry in result["at_real"].items():
-        span = "" if entry["low"] is None else f" [{entry['low']:.3g}, {entry['high']:.3g}]"
         spread = "" if entry["sd"] is None else f"{entry['sd']:.2g}"
-        each = ", ".join(f"{value:.3g}" for value in entry["values"])
+        elsewhere = result["under_prior"][source]
         solved = [run["solved"] for run in result["runs"] if run["source"] == source]
         when = ", ".join("never" if at is None else f"{at['frames']:,.0f}" for at in solved)
-        lines.append(f"| {source} | {entry['mean']:.3g}{span} | {spread} | {each} | {when} |")
+        other = f"{_with_interval(elsewhere)}: {_each(elsewhere)}"
+        cells = source, _with_interval(entry), spread, _each(entry), other, when
+        lines.append(f"| {' | '.join(cells)} |")
     told = [run["posterior"] for run in result["posteriors"]]
     if told:
         lines += ["", "| seed | posterior, mean ± sd | nats over the prior |", "|---|---|---|"]
@@ -85,6 +91,15 @@ def table(result: dict[str, Any]) -> str:
         cell = ", ".join(f"{name} {mean:.3g} ± {sd:.2g}" for name, mean, sd in moments)
         lines.append(f"| {run['seed']} | {cell} | {run['posterior']['nats_over_prior']:+.1f} |")
     return "\n".join(lines) + "\n"
+
+
+def _with_interval(entry: dict[str, Any]) -> str:
+    span = "" if entry["low"] is None else f" [{entry['low']:.3g}, {entry['high']:.3g}]"
+    return f"{entry['mean']:.3g}{span}"
+
+
+def _each(entry: dict[str, Any]) -> str:
+    return ", ".join(f"{value:.3g}" for value in entry["values"])
 
 
 def _truth(result: dict[str, Any]) -> Any:

@@ -116,8 +116,9 @@ class Study:
         real = robot.rollouts(learner.policy, episodes=settings.episodes, key=(self.seed, "real"))
         observed = statistics.together(comparable(real, horizon=steps))
         randomizer = DomainRandomizer(task.prior, seed=self.seed)
+        rows = min(64, settings.simulations * settings.episodes)
         pairs = simulate(
-            task.make(64, seed=self.seed, randomizer=randomizer),
+            task.make(rows, seed=self.seed, randomizer=randomizer),
             learner.policy,
             statistics,
             randomizer,
@@ -166,7 +167,13 @@ class Study:
             grids[name] = {"grid": values.tolist(), "score": means.tolist()}
         count = settings.real_episodes
         at_real = self._score(policy, Grid(truth[None]), count=count, seed=13)
-        return {"grids": grids, "at_real": at_real.mean().item(), "real_episodes": len(at_real)}
+        under_prior = self._score(policy, self.task.prior, count=count, seed=17)
+        return {
+            "grids": grids,
+            "at_real": at_real.mean().item(),
+            "under_prior": under_prior.mean().item(),
+            "real_episodes": len(at_real),
+        }
 
     def _score(self, policy: Any, source: Any, *, count: int, seed: int) -> Tensor:
         """Return return or success of ``count`` episodes, the same ones for the same seed."""

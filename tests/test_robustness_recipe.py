@@ -43,6 +43,7 @@ def test_curves_and_paired_differences_are_there(finished):
         assert len(curve["return_mean"]) == len(curve["return_sd"]) == 3
         assert all(0 <= mean <= 1 for mean in curve["return_mean"])
         assert curve["seeds"] == 2
+    assert result["under_prior"].keys() == result["at_real"].keys()
     real = result["at_real"]
     pairs = zip(real["posterior"]["values"], real["prior"]["values"], strict=True)
     assert real["posterior minus prior"]["values"] == pytest.approx([a - b for a, b in pairs])
@@ -82,12 +83,14 @@ def test_intervals_are_students(run):
     import robustness_report
 
     runs = [
-        {"source": source, "at_real": score}
+        {"source": source, "at_real": score, "under_prior": -score}
         for source, scores in {"prior": (1, 2, 3), "posterior": (3, 3, 6)}.items()
         for score in scores
     ]
-    found = robustness_report.at_real(runs)["posterior minus prior"]
+    found = robustness_report.compared(runs, "at_real")["posterior minus prior"]
     assert found["values"] == [2, 1, 3]
+    elsewhere = robustness_report.compared(runs, "under_prior")
+    assert elsewhere["posterior minus prior"]["values"] == [-2, -1, -3]
     # mean 2, standard deviation 1, and the 97.5 % quantile of t with 2 degrees of freedom, 4.3027
     assert found["high"] - found["mean"] == pytest.approx(4.3027 / 3**0.5, rel=1e-4)
 
