@@ -93,7 +93,9 @@ def job(settings: Sim2RealFetch, out: Path) -> dict[str, Any]:
     }
     curves = {"posterior": [point for entry in rounds for point in entry["curve"]]}
     if settings.video:
-        result["video"] = record(task, run.learner.policy, truth, out / "posterior.gif")
+        film = out / "posterior.gif"
+        episodes = 1 if settings.short else 4
+        result["video"] = record(task, run.learner.policy, truth, film, episodes=episodes)
     if settings.baseline:
         curves["prior"] = run.go_on_under_prior().curve
         baseline = score(run.learner.policy)

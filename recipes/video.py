@@ -47,7 +47,7 @@ class GifLogger(Logger):
 
 
 def record(
-    task: GoalTask, policy: Any, theta: Tensor, path: Path, *, episodes: int = 4, size: int = 240
+    task: GoalTask, policy: Any, theta: Tensor, path: Path, *, episodes: int, size: int = 240
 ) -> str | None:
     """Film episodes at given physics; return the file, or None where nothing can be rendered."""
     os.environ.setdefault("MUJOCO_GL", "egl")
