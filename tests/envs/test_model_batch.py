@@ -125,7 +125,7 @@ def test_reading_an_entry_that_nobody_wrote_gives_the_nominal_value():
         ("body_mass", (9,), r"the index of a floating-point number in body_mass of shape \(4,\)"),
         ("body_mass", (), "the index of"),
         ("geom_priority", (0,), "the index of"),
-        ("body_ipos", (3, 0), "a body whose centre of mass is not at its origin"),
+        ("body_ipos", (3, 0), "a body whose mass matrix may change, to set body_ipos"),
     ],
 )
 def test_an_entry_that_does_not_exist_is_refused(field, indices, match):

@@ -371,5 +371,5 @@ def test_moving_a_centre_of_mass_does_the_same_in_one_environment_and_in_a_batch
 
 
 def test_a_centre_of_mass_that_mujoco_fixes_at_the_origin_cannot_be_moved():
-    with pytest.raises(PhysicsError, match="a body whose centre of mass is not at its origin"):
+    with pytest.raises(PhysicsError, match="a body whose mass matrix may change, to set body_ipos"):
         write(arm(), MujocoPhysics("body_ipos[ball,0]"), 0.1)

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..physics.mujoco import DERIVED_FROM
+from ..physics.consequences import DERIVED_FROM
 
 Entry = tuple[str, tuple[int, ...]]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..physics.mujoco import DERIVED_FROM
+from ..physics.consequences import DERIVED_FROM
 from .effect import ModelEffect
 from .fields import Entry, ModelFields, Models
 from .robot import Robot

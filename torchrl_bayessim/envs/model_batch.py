@@ -12,7 +12,6 @@ __all__ = ["ModelBatch"]
 
 import copy
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,8 +19,11 @@ from numpy.typing import NDArray
 
 from ..errors import PhysicsError, SimulationError, message
 from ..physics.assignments import Assignments
-from ..physics.frames import separate
+from ..physics.consequences import BOUNDS, bad_value, check_settable, check_values
+from ..physics.frames import separate, unskip
+from ..physics.geom_bounds import fit_bounds
 from . import native
+from .addresses import SCALARS, address, attribute
 from .fatal_errors import FAULT_SIZE, fault_text
 
 # What mj_setConst derives from masses, inertias and geometry (engine_setconst.c); the visual
@@ -37,39 +39,20 @@ _DERIVED = (
     "actuator_length0",
     "stat.meaninertia",
 )
-# Scalars of mjOption and mjStatistic have no array in Python: their distance, in numbers, from
-# one that has (the order of the structs in mjmodel.h).
-_SCALARS = {
-    "opt.timestep": ("opt.gravity", -7),
-    "opt.impratio": ("opt.gravity", -6),
-    "opt.tolerance": ("opt.gravity", -5),
-    "opt.ls_tolerance": ("opt.gravity", -4),
-    "opt.noslip_tolerance": ("opt.gravity", -3),
-    "opt.ccd_tolerance": ("opt.gravity", -2),
-    "opt.density": ("opt.gravity", 9),
-    "opt.viscosity": ("opt.gravity", 10),
-    "opt.o_margin": ("opt.gravity", 11),
-    "stat.meaninertia": ("stat.center", -4),
-}
+_Place = tuple[str, tuple[int, ...]]
 _SHARE = 32  # environments that are worth another thread
 
 
-def _attribute(model: mujoco.MjModel, field: str) -> Any:
-    value: Any = model
-    for part in field.split("."):
-        value = getattr(value, part)
-    return value
-
-
-def _address(model: mujoco.MjModel, field: str, indices: tuple[int, ...]) -> int:
-    """Return the address of one number of ``model``."""
-    if field in _SCALARS:
-        anchor, offset = _SCALARS[field]
-        return np.asarray(_attribute(model, anchor)).ctypes.data + 8 * offset
-    array = np.asarray(_attribute(model, field))
-    return array.ctypes.data + sum(
-        i * stride for i, stride in zip(indices, array.strides, strict=True)
-    )
+def _derived(model: mujoco.MjModel) -> list[_Place]:
+    """Return the numbers that mj_setConst derives: also where loops close (``eq_data``)."""
+    places: list[_Place] = []
+    for field in _DERIVED:
+        shape = () if field in SCALARS else np.shape(attribute(model, field))
+        places += [(field, indices) for indices in np.ndindex(shape)]
+    connects = model.eq_type == mujoco.mjtEq.mjEQ_CONNECT
+    connects &= model.eq_objtype == mujoco.mjtObj.mjOBJ_BODY
+    rows = np.flatnonzero(connects).tolist()
+    return places + [("eq_data", (row, column)) for row in rows for column in (3, 4, 5)]
 
 
 class _Scratch:
@@ -112,7 +95,8 @@ class ModelBatch:
         self.model, self.threads = model, threads
         self.num_envs = num_envs
         self.table: NDArray[np.float64] = np.empty((num_envs, 0))
-        self._columns: dict[tuple[str, tuple[int, ...]], int] = {}
+        self._columns: dict[_Place, int] = {}
+        self._bounding: list[_Place] = []  # those that `fit_bounds` looks at
         self._places: dict[Assignments, NDArray[np.int64]] = {}
         self._scratch: list[_Scratch] = []
         self._pool: ThreadPoolExecutor | None = None
@@ -126,8 +110,7 @@ class ModelBatch:
     ) -> None:
         """Set one entry of the model in the environments ``rows``.
 
-        Constants that MuJoCo derives from masses, inertias and positions stay stale until
-        `refresh`.
+        What follows from masses, inertias, sizes and positions stays stale until `refresh`.
 
         Args:
             field: An attribute of ``MjModel`` that holds floating-point numbers (``body_mass``),
@@ -137,23 +120,34 @@ class ModelBatch:
             rows: Which environments to write, boolean, shape ``(N,)``; default all.
 
         Raises:
-            PhysicsError: The model has no such entry.
+            PhysicsError: The model has no such entry, it cannot be set, or not to these values
+                (see `consequences`).
             ValueError: ``values`` or ``rows`` has not shape ``(N,)``.
         """
         values = np.asarray(values, dtype=np.float64)
         if values.shape != (self.num_envs,):
             expected = f"one value per environment, shape ({self.num_envs},)"
             raise ValueError(message(expected, values.shape))
-        column = self._columns.get((field, indices))
-        if column is None:
-            column = self._add(field, indices)
-        if rows is None:
-            self.table[:, column] = values
-        elif np.shape(rows) == (self.num_envs,):
-            np.copyto(self.table[:, column], values, where=np.asarray(rows))
-        else:
+        if rows is not None and np.shape(rows) != (self.num_envs,):
             expected = f"a mask of environments, shape ({self.num_envs},)"
             raise ValueError(message(expected, np.shape(rows)))
+        if (field, indices) not in self._columns:
+            self._nominal(field, indices)  # or an error that says what there is
+            check_settable(self.model, field, indices)
+        check_values((field, indices), values if rows is None else values[rows])
+        self.put(field, indices, values, rows)
+
+    def put(
+        self,
+        field: str,
+        indices: tuple[int, ...],
+        values: NDArray[np.float64],
+        rows: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Do what `write` does without asking whether the entry may be set."""
+        column = self.column(field, indices)
+        where = True if rows is None else np.asarray(rows)
+        np.copyto(self.table[:, column], values, where=where)
 
     def assign(
         self, entries: Assignments, theta: NDArray[np.float64], rows: NDArray[np.bool_]
@@ -161,13 +155,16 @@ class ModelBatch:
         """Set entries from parameters ``theta``, shape ``(N, D)``, in the environments ``rows``.
 
         Raises:
+            PhysicsError: A value is not finite, or negative where it cannot be; none is written.
             ValueError: ``theta`` or ``rows`` are for another number of environments.
         """
         if not len(theta) == len(rows) == self.num_envs:
             expected = f"parameters and a mask of {self.num_envs} environments"
             raise ValueError(message(expected, f"{theta.shape} and {rows.shape}"))
         places = self._columns_of(entries)
-        native.assign(self.table, rows, theta, places, entries.numbers)
+        row, number = native.assign(self.table, rows, theta, places, entries.numbers)
+        if row >= 0:
+            raise bad_value(entries.places[number], float(theta[row, places[number, 0]]))
 
     def held(self, entries: Assignments) -> NDArray[np.float64]:
         """Return the entries' values as parameters, so without their signs, shape ``(N, P)``."""
@@ -195,20 +192,22 @@ class ModelBatch:
         return self._add(field, indices) if known is None else known
 
     def refresh(self, rows: NDArray[np.bool_] | None = None) -> None:
-        """Recompute what MuJoCo derives from masses, inertias and positions (``mj_setConst``).
+        """Bring up to date what follows from entries that were written; see `consequences`.
 
         Args:
             rows: Which environments to refresh, boolean, shape ``(N,)``; default all.
 
         Raises:
+            PhysicsError: A quaternion is not of unit length.
             SimulationError: MuJoCo cannot evaluate the physics of an environment.
         """
         if not self._scratch:
             self._scratch.append(_Scratch(self.model))
-            for field in _DERIVED:
-                shape = () if field in _SCALARS else np.shape(_attribute(self.model, field))
-                for indices in np.ndindex(shape):
-                    self.column(field, indices)
+            for place in _derived(self.model):
+                self.column(*place)
+        if self._bounding:
+            mask = np.ones(self.num_envs, dtype=bool) if rows is None else np.asarray(rows)
+            fit_bounds(self, list(self._bounding), mask)
         selected = np.arange(self.num_envs) if rows is None else np.flatnonzero(rows)
         threads = min(self.threads, len(selected) // _SHARE)
         if threads < 2:
@@ -228,8 +227,8 @@ class ModelBatch:
         scratch = self._scratch[thread]
         if len(scratch.columns) != len(self._columns):
             scratch.columns = self.addresses(scratch.model)
-            places = [c for key, c in self._columns.items() if key[0] in _DERIVED]
-            scratch.derived = np.array(places, dtype=np.int64)
+            columns = [self._columns[place] for place in _derived(self.model)]
+            scratch.derived = np.array(columns, dtype=np.int64)
         columns, derived = scratch.columns, scratch.derived
         bad = native.refresh(scratch.owned, rows, self.table, columns, derived)
         if bad >= 0:
@@ -255,7 +254,7 @@ class ModelBatch:
         Both know the same entries, and the same of them are overridden, from then on separately.
         """
         other = ModelBatch(self.model, self.num_envs * count, threads=self.threads)
-        other._columns = dict(self._columns)
+        other._columns, other._bounding = dict(self._columns), list(self._bounding)
         other.table = np.repeat(self.table, count, axis=0)
         return other
 
@@ -268,10 +267,11 @@ class ModelBatch:
 
         The copy is told not to take short cuts that hold for the nominal values only.
         """
+        unskip(model, self._columns)
         for field, indices in self._columns:
             if indices:
                 separate(model, field, indices[0])
-        return np.array([_address(model, *key) for key in self._columns], dtype=np.int64)
+        return np.array([address(model, *key) for key in self._columns], dtype=np.int64)
 
     def copy_of(self, row: int) -> mujoco.MjModel:
         """Return a model with the physics of environment ``row``, for use outside the batch."""
@@ -281,10 +281,8 @@ class ModelBatch:
 
     def _add(self, field: str, indices: tuple[int, ...]) -> int:
         value = self._nominal(field, indices)
-        if field in ("body_ipos", "body_iquat") and self.model.body_simple[indices[0]]:
-            hint = "give the body simple='false' in the MJCF"
-            expected = "a body whose centre of mass is not at its origin, to move it"
-            raise PhysicsError(message(expected, self.model.body(indices[0]).name, hint=hint))
+        if field in BOUNDS or field.endswith("quat"):
+            self._bounding.append((field, indices))
         column = np.full((self.num_envs, 1), value)
         self.table = np.concatenate([self.table, column], axis=1)
         self._columns[field, indices] = len(self._columns)
@@ -292,7 +290,7 @@ class ModelBatch:
 
     def _nominal(self, field: str, indices: tuple[int, ...]) -> float:
         try:
-            value = np.asarray(_attribute(self.model, field))
+            value = np.asarray(attribute(self.model, field))
         except AttributeError:
             names = [
                 name
@@ -303,7 +301,7 @@ class ModelBatch:
         inside = len(indices) == value.ndim and all(
             0 <= i < n for i, n in zip(indices, value.shape, strict=False)
         )
-        if not inside or value.dtype != np.float64 or (not indices and field not in _SCALARS):
+        if not inside or value.dtype != np.float64 or (not indices and field not in SCALARS):
             expected = f"the index of a floating-point number in {field} of shape {value.shape}"
             raise PhysicsError(message(expected, indices))
         return float(value[indices])

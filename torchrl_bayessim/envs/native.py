@@ -90,13 +90,23 @@ def override(addresses, table, i):
 
 @compiled
 def assign(table, rows, theta, places, numbers):
-    """Write the entries of ``rows``, a mask, that follow from parameters; see `Assignments`."""
-    for i in range(rows.shape[0]):
-        if rows[i]:
-            for p in range(places.shape[0]):
-                value = theta[i, places[p, 0]]
-                base, scale, nominal = numbers[p]
-                table[i, places[p, 1]] = nominal if math.isnan(value) else base * (value / scale)
+    """Write the entries of ``rows``, a mask, that follow from parameters; see `Assignments`.
+
+    Nothing is written if a value is not finite or too small; then the first such row and number
+    are returned, else -1 and -1.
+    """
+    for write in (False, True):
+        for i in range(rows.shape[0]):
+            if rows[i]:
+                for p in range(places.shape[0]):
+                    value = theta[i, places[p, 0]]
+                    base, scale, nominal, least = numbers[p]
+                    new = nominal if math.isnan(value) else base * (value / scale)
+                    if write:
+                        table[i, places[p, 1]] = new
+                    elif not (least <= new < math.inf) or new == -math.inf:
+                        return i, p
+    return -1, -1
 
 
 @compiled

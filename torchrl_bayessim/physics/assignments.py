@@ -7,10 +7,12 @@ __all__ = ["Assignments", "assignments"]
 from dataclasses import dataclass
 from typing import Protocol
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PhysicsError, message
+from .consequences import check_settable, lowest
 from .model_fields import Entries
 
 
@@ -24,9 +26,8 @@ class Assignments:
     Attributes:
         places: Field and indices of each number.
         parameter: The column of θ that it follows from, shape ``(P,)``.
-        numbers: ``base``, ``scale`` and ``nominal``, shape ``(P, 3)``.
+        numbers: ``base``, ``scale``, ``nominal`` and the least value allowed, shape ``(P, 4)``.
         groups: The numbers that are each parameter's own, by position; others follow from them.
-        sized: Geoms whose size is among the numbers.
         fields: The fields that they are in.
     """
 
@@ -34,11 +35,12 @@ class Assignments:
     parameter: NDArray[np.int64]
     numbers: NDArray[np.float64]
     groups: tuple[tuple[int, ...], ...]
-    sized: tuple[int, ...]
     fields: frozenset[str]
 
 
 class _Models(Protocol):
+    model: mujoco.MjModel
+
     def nominal(self, field: str, indices: tuple[int, ...]) -> float: ...
 
 
@@ -46,10 +48,10 @@ def assignments(models: _Models, groups: list[list[Entries]]) -> Assignments:
     """Return what to set in a model for parameters that each set a group of entries.
 
     Raises:
-        PhysicsError: The mass of a body without a nominal one, whose inertia cannot follow it.
+        PhysicsError: An entry cannot be set, or has no effect; the mass of a body without a nominal
+            one, whose inertia cannot follow it.
 
     Example:
-        >>> import mujoco
         >>> from torchrl_bayessim.physics.model_fields import resolve
         >>> from torchrl_bayessim.physics.mujoco_models import MujocoModels
         >>> model = mujoco.MjModel.from_xml_string(
@@ -67,6 +69,7 @@ def assignments(models: _Models, groups: list[list[Entries]]) -> Assignments:
     # Masses first: they scale inertias, which may be parameters themselves.
     for parameter, entry in sorted(every, key=lambda pair: pair[1].field != "body_mass"):
         for indices in entry.indices:
+            check_settable(models.model, entry.field, indices)
             own[parameter].append(len(rows))
             rows.append((entry.field, indices, parameter, entry.sign, 1.0))
             if entry.field == "body_mass":
@@ -74,9 +77,8 @@ def assignments(models: _Models, groups: list[list[Entries]]) -> Assignments:
     return Assignments(
         places=tuple(row[:2] for row in rows),
         parameter=np.array([row[2] for row in rows]),
-        numbers=np.array([(*row[3:], models.nominal(*row[:2])) for row in rows]),
+        numbers=np.array([(*row[3:], models.nominal(*row[:2]), lowest(row[0])) for row in rows]),
         groups=tuple(tuple(positions) for positions in own.values()),
-        sized=tuple(dict.fromkeys(row[1][0] for row in rows if row[0] == "geom_size")),
         fields=frozenset(row[0] for row in rows),
     )
 

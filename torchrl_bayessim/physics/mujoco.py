@@ -13,7 +13,7 @@ set both geoms, under one name::
 
 from __future__ import annotations
 
-__all__ = ["DERIVED_FROM", "MujocoPhysics"]
+__all__ = ["MujocoPhysics"]
 
 import numpy as np
 import torch
@@ -23,15 +23,10 @@ from torchrl.envs import EnvBase
 
 from ..errors import message
 from .assignments import Assignments, assignments
-from .geom_bounds import fit_bounds
+from .consequences import DERIVED_FROM
 from .model_fields import resolve
 from .mujoco_models import MujocoModels, models_of
 
-# Fields from which mj_setConst derives others (inverse weights, subtree masses, lengths at qpos0).
-DERIVED_FROM = {
-    "body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat",
-    "dof_armature", "jnt_pos", "jnt_axis", "site_pos", "actuator_gear", "tendon_stiffness",
-}  # fmt: skip
 _UNITS = {
     "body_mass": "kg", "body_inertia": "kg m²", "body_ipos": "m", "body_pos": "m", "geom_size": "m",
     "dof_damping": "N m s/rad", "dof_frictionloss": "N m", "dof_armature": "kg m²",
@@ -43,8 +38,9 @@ _UNITS = {
 class MujocoPhysics:
     """Sets entries of the model; what follows from them follows.
 
-    A body's inertia scales with its mass, a geom's bounds with its size, and what MuJoCo derives
-    from masses, inertias, positions and gears is recomputed (``mj_setConst``).
+    A body's inertia scales with its mass, the bounds of geoms follow their sizes and places, and
+    what MuJoCo derives from masses, inertias, positions and gears is recomputed; entries that
+    cannot be set, or to no effect, are refused (see `consequences`).
 
     Args:
         *targets: Entries, each a parameter of that name; `model_fields` says how to write them.
@@ -97,8 +93,6 @@ class MujocoPhysics:
         values = theta.numpy().astype(np.float64, copy=False).reshape(-1, len(self.names))
         rows = mask.numpy().reshape(-1)
         models.assign(entries, values, rows)
-        for geom in entries.sized:
-            fit_bounds(models, geom, rows)
         if not DERIVED_FROM.isdisjoint(entries.fields):
             models.refresh(rows)
 

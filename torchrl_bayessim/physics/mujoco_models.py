@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from ..errors import PhysicsError, message
 from .assignments import Assignments
+from .consequences import bad_value, check_settable, check_values
 from .frames import separate
+from .geom_bounds import fit_bounds
 
 
 class MujocoModels:
@@ -28,6 +30,7 @@ class MujocoModels:
         self.resolved: dict[tuple[tuple[str, ...], ...], Assignments] = {}
         self._nominal: dict[str, NDArray[np.float64]] = {}
         self._scratch: mujoco.MjData | None = None
+        self._written: dict[tuple[str, tuple[int, ...]], None] = {}
 
     def nominal(self, field: str, indices: tuple[int, ...]) -> float:
         """Return the value of an entry before anything was written."""
@@ -48,16 +51,37 @@ class MujocoModels:
         values: NDArray[np.float64],
         rows: NDArray[np.bool_],
     ) -> None:
-        """Set an entry in the environments ``rows``."""
+        """Set an entry in the environments ``rows``; see `consequences` for which may be set.
+
+        Raises:
+            PhysicsError: The entry cannot be set, or not to this value.
+        """
         if self._batch is not None:
             self._batch.write(field, indices, values, rows)
+        elif rows.all():
+            if (field, indices) not in self._written:
+                check_settable(self.model, field, indices)
+            check_values((field, indices), values)
+            self.put(field, indices, values, rows)
+
+    def put(
+        self,
+        field: str,
+        indices: tuple[int, ...],
+        values: NDArray[np.float64],
+        rows: NDArray[np.bool_],
+    ) -> None:
+        """Set an entry without asking whether it may be set."""
+        if self._batch is not None:
+            self._batch.put(field, indices, values, rows)
         elif rows.all():
             self.nominal(field, indices)
             self._set(field, indices, float(values[0]))
 
     def _set(self, field: str, indices: tuple[int, ...], value: float) -> None:
+        self._written[field, indices] = None
         if indices:
-            _let_move(self.model, field, indices[0])
+            separate(self.model, field, indices[0])
             _array(self.model, field)[indices] = value
         else:
             setattr(self.model.opt, field.removeprefix("opt."), value)
@@ -65,13 +89,20 @@ class MujocoModels:
     def assign(
         self, entries: Assignments, theta: NDArray[np.float64], rows: NDArray[np.bool_]
     ) -> None:
-        """Set what follows from ``theta``, shape ``(N, D)``, in the environments ``rows``."""
+        """Set what follows from ``theta``, shape ``(N, D)``, in the environments ``rows``.
+
+        Raises:
+            PhysicsError: A value is not finite, or negative where it cannot be.
+        """
         if self._batch is not None:
             self._batch.assign(entries, theta, rows)
         elif rows.all():
-            base, scale, nominal = entries.numbers.T
+            base, scale, nominal, least = entries.numbers.T
             new = base * (theta[0, entries.parameter] / scale)
             new = np.where(np.isnan(new), nominal, new)
+            if not (good := np.isfinite(new) & (new >= least)).all():
+                wrong = int(good.argmin())
+                raise bad_value(entries.places[wrong], float(new[wrong]))
             for (field, indices), value in zip(entries.places, new.tolist(), strict=True):
                 self._set(field, indices, value)
 
@@ -83,10 +114,11 @@ class MujocoModels:
         return np.array([values]) * np.sign(entries.numbers[:, 0])
 
     def refresh(self, rows: NDArray[np.bool_]) -> None:
-        """Recompute what MuJoCo derives from other entries (``mj_setConst``)."""
+        """Bring up to date what follows from entries that were written; see `consequences`."""
         if self._batch is not None:
             self._batch.refresh(rows)
         elif rows.all():
+            fit_bounds(self, list(self._written), rows)
             if self._scratch is None:  # mj_setConst leaves its data at qpos0: not the simulator's
                 self._scratch = mujoco.MjData(self.model)
             view = ("center", "extent", "meansize", "meanmass")  # may be set in the XML
@@ -126,11 +158,3 @@ def _model(env: Any) -> mujoco.MjModel:
     if not isinstance(model, mujoco.MjModel):
         raise PhysicsError(message("an environment with an MjModel", type(inner).__name__))
     return model
-
-
-def _let_move(model: mujoco.MjModel, field: str, row: int) -> None:
-    if field in ("body_ipos", "body_iquat") and model.body_simple[row]:
-        hint = "give the body simple='false' in the MJCF"
-        expected = "a body whose centre of mass is not at its origin, to move it"
-        raise PhysicsError(message(expected, model.body(row).name, hint=hint))
-    separate(model, field, row)
