@@ -2,7 +2,8 @@
 
 Closed loop without TorchRL's collector (``env.step`` with random actions), per-environment mass and
 friction. Memory is what an environment adds to the process, by the resident set of a fresh process
-with few and with many environments. Prints one JSON line per figure::
+with few and with many environments. Everything is drawn with seed 0. Prints one JSON line per
+figure::
 
     python recipes/benchmarks/batched_mujoco_scaling.py [steps=20] [runs=3]
 """
@@ -67,16 +68,26 @@ def main(*arguments: str) -> None:
     rates = compare(sizes, runs=given["runs"])
     for case, values in rates.items():
         against = {"N=256": rates["N=256"]}
-        report("batched_mujoco_scaling", f"{task} {case}", values, against=against, threads=cores)
+        report(
+            "batched_mujoco_scaling",
+            f"{task} {case}",
+            values,
+            against=against,
+            seed=0,
+            threads=cores,
+        )
     teams = {f"threads={k}": stepping(task, 256, k, steps) for k in sorted({1, 2, cores})}
     rates = compare(teams, runs=given["runs"])
     for case, values in rates.items():
-        against = {"threads=1": rates["threads=1"]}
-        report("batched_mujoco_scaling", f"{task} N=256 {case}", values, against=against)
+        against, k = {"threads=1": rates["threads=1"]}, int(case.split("=")[1])
+        label = f"{task} N=256 {case}"
+        report("batched_mujoco_scaling", label, values, against=against, seed=0, threads=k)
     for name in ("Hopper-v5", "Humanoid-v5", "FetchPush-v4"):
-        few, many = resident(name, 16), resident(name, 4096)
-        each = [(many - few) / (4096 - 16)]
-        report("batched_mujoco_scaling", f"{name} memory per environment", each, unit="kB")
+        each = [
+            (resident(name, 4096) - resident(name, 16)) / (4096 - 16) for _ in range(given["runs"])
+        ]
+        label = f"{name} memory per environment"
+        report("batched_mujoco_scaling", label, each, unit="kB", seed=0, threads=2)
 
 
 if __name__ == "__main__":

@@ -1,22 +1,18 @@
 """Frames per second of the batched classic-control environments against `GymEnv`.
 
-Random policy, auto-resets, both through the collector of TorchRL; one thread. Prints one JSON line
-per system and batch size::
+Random policy, auto-resets, both through the collector of TorchRL; one thread. Cases take turns.
+Prints one JSON line per system and batch size::
 
-    python recipes/benchmarks/classic_control.py [seconds=1] [runs=3]
+    python recipes/benchmarks/classic_control.py [frames=2000] [runs=5]
 """
 
 from __future__ import annotations
 
-import json
-import platform
-import statistics
 import sys
-import time
+from collections.abc import Callable
 
-import gymnasium
 import torch
-import torchrl
+from measuring import compare, options, report
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, GymEnv
 
@@ -35,59 +31,43 @@ SYSTEMS = {
     "MountainCarContinuous-v0": (MountainCarContinuousEnv, 999),
     "Acrobot-v1": (AcrobotEnv, 500),
 }
+STEPS = 50  # of every environment in a batch
 
 
-def frames_per_second(env: EnvBase, *, steps: int, seconds: float, runs: int) -> list[float]:
-    """Return one figure per run, after a warm-up batch."""
-    frames = steps * env.batch_size.numel()
+def collecting(env: EnvBase, frames: int) -> Callable[[], int]:
+    """Return a case: batches of ``STEPS`` per environment, at least ``frames`` in all."""
+    size = STEPS * (env.batch_size.numel() or 1)
     collector = Collector(
-        env, None, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=True
+        env, None, frames_per_batch=size, total_frames=-1, auto_register_policy_transforms=True
     )
     batches = iter(collector)
-    next(batches)
-    figures = []
-    for _ in range(runs):
-        start, collected = time.perf_counter(), 0
-        while (elapsed := time.perf_counter() - start) < seconds:
-            next(batches)
-            collected += frames
-        figures.append(collected / elapsed)
-    collector.shutdown()
-    return figures
+
+    def case() -> int:
+        count = 0
+        while count < frames:
+            count += next(batches).numel()
+        return count
+
+    return case
 
 
 def main(*arguments: str) -> None:
     """Measure every system at several batch sizes."""
-    options = {"seconds": "1", "runs": "3"} | dict(a.split("=", 1) for a in arguments)
-    timing = {"seconds": float(options["seconds"]), "runs": int(options["runs"])}
+    given = options(list(arguments), frames=2000, runs=5)
     torch.set_num_threads(1)
-    torch.manual_seed(0)  # the random policy's
-    provenance = {
-        "seed": 0,
-        "threads": 1,
-        "torch": torch.__version__,
-        "torchrl": torchrl.__version__,
-        "gymnasium": gymnasium.__version__,
-        "machine": platform.processor() or platform.machine(),
-    }
+    torch.manual_seed(0)  # of the random policy
     for name, (system, max_steps) in SYSTEMS.items():
-        gym = statistics.median(frames_per_second(GymEnv(name), steps=200, **timing))
-        for n in (1, 64, 1024, 4096):
-            env = system(n, max_steps=max_steps)
-            figures = frames_per_second(env, steps=50, **timing)
-            median = statistics.median(figures)
-            line = {
-                "benchmark": "classic_control",
-                "case": f"{name} N={n}",
-                "value": round(median),
-                "unit": "frames/s",
-                "median": round(median),
-                "min": round(min(figures)),
-                "max": round(max(figures)),
-                "runs": len(figures),
-                "against": {"GymEnv": round(median / gym, 1)},
-            }
-            print(json.dumps(line | {"GymEnv frames/s": round(gym)} | provenance), flush=True)
+        envs = {"GymEnv": GymEnv(name)}
+        envs |= {f"N={n}": system(n, max_steps=max_steps) for n in (1, 64, 1024, 4096)}
+        more = {"N=1024": 100, "N=4096": 100, "N=64": 10}
+        cases = {
+            case: collecting(env, given["frames"] * more.get(case, 1)) for case, env in envs.items()
+        }
+        rates = compare(cases, runs=given["runs"])
+        for case, values in rates.items():
+            against = {"GymEnv": rates["GymEnv"]}
+            label = f"{name} {case}"
+            report("classic_control", label, values, against=against, seed=0, threads=1)
 
 
 if __name__ == "__main__":

@@ -80,7 +80,8 @@ def main(*arguments: str) -> None:
     }
     for case, values in nats.items():
         gained = sum(a - b for a, b in zip(nats["excited"], values, strict=True)) / len(values)
-        report("excitation", case, values, unit="nats", excited_gains=round(gained, 3))
+        context = {"seed": f"0 to {len(values) - 1}", "threads": 1}
+        report("excitation", case, values, unit="nats", excited_gains=round(gained, 3), **context)
 
 
 if __name__ == "__main__":

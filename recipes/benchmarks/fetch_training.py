@@ -91,7 +91,7 @@ def main(*arguments: str) -> None:
     for name, values in rates.items():
         other = f"{name}, gymnasium-robotics"
         against = {other: rates[other]} if other in rates else {}
-        context = {"task": task, "n": n, "threads": threads, "updates_per_frame": given["updates"]}
+        context = {"task": task, "n": n, "threads": threads, "seed": 0, "updates": given["updates"]}
         report("fetch_training", name, values, against=against, **context)
 
 

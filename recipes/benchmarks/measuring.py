@@ -45,11 +45,24 @@ def report(
     case: str,
     values: list[float],
     *,
+    seed: int | str,
+    threads: int,
     unit: str = "frames/s",
     against: Mapping[str, list[float]] | None = None,
     **context: object,
 ) -> None:
-    """Print one JSON line; ``against`` gives medians of the ratios within a run."""
+    """Print one JSON line: median, spread, seed, threads, versions and what else the machine did.
+
+    Args:
+        benchmark: The script.
+        case: What was measured.
+        values: One per run.
+        seed: Of everything that was drawn; in words for several.
+        threads: That the case may use.
+        unit: Of the values.
+        against: Other cases of the same runs; the line gives medians of the ratios within a run.
+        **context: What else a reader needs to repeat it.
+    """
     ratios = {
         name: round(statistics.median(a / b for a, b in zip(values, other, strict=True)), 3)
         for name, other in (against or {}).items()
@@ -65,6 +78,8 @@ def report(
         "max": _rounded(max(values)),
         "runs": len(values),
         "against": ratios,
+        "seed": seed,
+        "threads": threads,
     }
     print(json.dumps(line | context | dict(_provenance())), flush=True)
 

@@ -4,7 +4,7 @@ Microseconds per environment: of writing one entry of the model, of recomputing 
 mass (``mj_setConst``), and of both through `MujocoPhysics`; for all of N environments at once and
 for one among them. Prints one JSON line per case::
 
-    python recipes/benchmarks/physics_writes.py [n=256] [runs=7]
+    python recipes/benchmarks/physics_writes.py [n=256] [runs=7] [threads=1]
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def microseconds(call: Callable[[], object], *, environments: int, runs: int) ->
 def cases(env: BatchedMujocoEnv, count: int) -> dict[str, Callable[[], object]]:
     """Return ways to write the physics of the first ``count`` environments."""
     n = env.num_envs
-    mask, theta = torch.arange(n) < count, torch.rand(n, 1) + 3.0
+    mask, theta = torch.arange(n) < count, 3.0 + torch.rand(n, 1, generator=_draws())
     rows, values = mask.numpy(), theta[:, 0].double().numpy()
     through = {"theta": theta, "mask": mask, "tensordict": TensorDict(batch_size=[n])}
     friction, mass = MujocoPhysics("geom_friction[floor,0]"), MujocoPhysics("body_mass[torso]")
@@ -49,17 +49,22 @@ def cases(env: BatchedMujocoEnv, count: int) -> dict[str, Callable[[], object]]:
     }
 
 
+def _draws() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
 def main(*arguments: str) -> None:
     """Measure writes of the physics of Hopper and Humanoid."""
-    given = options(list(arguments), n=256, runs=7)
+    given = options(list(arguments), n=256, runs=7, threads=1)
     torch.set_num_threads(1)
     for task in ("Hopper-v5", "Humanoid-v5"):
-        env = BatchedMujocoEnv(task, given["n"])
+        env = BatchedMujocoEnv(task, given["n"], threads=given["threads"])
         for count in (given["n"], 1):
             for name, call in cases(env, count).items():
                 figures = microseconds(call, environments=count, runs=given["runs"])
+                context = {"seed": 0, "threads": given["threads"]}
                 case = f"{task} {name}, {count} of {given['n']}"
-                report("physics_writes", case, figures, unit="us/environment")
+                report("physics_writes", case, figures, unit="us/environment", **context)
 
 
 if __name__ == "__main__":

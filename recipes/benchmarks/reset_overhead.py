@@ -123,6 +123,7 @@ def main(*arguments: str) -> None:
     """Measure every kind of environment, with and without randomisation."""
     given = options(list(arguments), runs=7, steps=100, frames=4000)
     torch.set_num_threads(1)
+    torch.manual_seed(0)  # of the random policy
     kinds = {
         "GymEnv": single,
         "SerialEnv": bare,
@@ -142,7 +143,8 @@ def main(*arguments: str) -> None:
             others = {other: rates[other] for other in ("plain", "idle") if other != case}
             against = others if case == "randomized" else None
             label = f"{name} {case}"
-            report("reset_overhead", label, values, against=against, steps=given["steps"])
+            context = {"steps": given["steps"], "seed": 0, "threads": 1}
+            report("reset_overhead", label, values, against=against, **context)
 
 
 if __name__ == "__main__":

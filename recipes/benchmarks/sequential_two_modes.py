@@ -112,9 +112,9 @@ def measure(case: str, method: Callable[[int], LogDensity], seeds: int) -> None:
         "worst_seeds": sorted(range(seeds), key=distances.__getitem__)[-3:],
         "failures": sorted(set(failures)),
     }
-    name = "sequential_two_modes"
-    report(name, case, distances, unit="total variation", seeds=seeds, **shares)
-    report(name, f"{case}, seconds", seconds, unit="s", seeds=seeds)
+    name, context = "sequential_two_modes", {"seed": f"0 to {seeds - 1}", "threads": 1}
+    report(name, case, distances, unit="total variation", **context, **shares)
+    report(name, f"{case}, seconds", seconds, unit="s", **context)
 
 
 def main(*arguments: str) -> None:
