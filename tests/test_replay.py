@@ -235,5 +235,7 @@ def test_bad_calls_are_refused():
         model(torch.zeros(0, 1))
     with pytest.raises(ValueError, match="every='control', or 'time'"):
         model(hook=lambda now: {}, every="day")
+    with pytest.raises(KeyError, match=r"ctrl \(did you mean this\?\)"):
+        model(hook=lambda now: {"ctr": now.ctrl})
     with pytest.raises(ValueError, match="segments with qpos, qvel and action"):
         replay(slider(), {"qpos": torch.zeros(1, 1)})

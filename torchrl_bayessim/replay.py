@@ -200,6 +200,9 @@ class Replay:
                     self._commands[:, t]
                 )
                 for name, value in hook(readings).items():
+                    if name not in vars(readings):
+                        known = vars(readings)
+                        raise KeyError(message("a component of the state", name, available=known))
                     getattr(readings, name).copy_(value)
                 stepper.rollout(
                     command,

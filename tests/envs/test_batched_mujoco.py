@@ -296,6 +296,14 @@ def test_functions_of_a_task_are_checked_at_the_start(change, error, match):
         BatchedMujocoEnv(pendulum(**change), 2)
 
 
+def test_a_task_is_checked_when_it_is_made():
+    for number in (0, 1.5):
+        with pytest.raises(ValueError, match=f"frame_skip to be a positive integer, got {number}"):
+            pendulum(frame_skip=number)
+    with pytest.raises(KeyError, match=r"qpos \(did you mean this\?\)"):
+        pendulum(initial={"qpso": np.zeros(1)})
+
+
 def test_a_sequence_of_no_actions_is_refused():
     with pytest.raises(ValueError, match=r"T at least 1, got \(2, 0, 1\)"):
         BatchedMujocoEnv(pendulum(), 2).open_loop(torch.zeros(2, 0, 1))

@@ -137,8 +137,11 @@ def test_a_wrong_number_of_values_or_rows_is_refused():
     models = ModelBatch(model(), 2)
     with pytest.raises(ValueError, match=r"one value per environment, shape \(2,\), got \(3,\)"):
         models.write("body_mass", (1,), np.zeros(3))
-    with pytest.raises(ValueError, match=r"a mask of environments, shape \(2,\)"):
-        models.write("body_mass", (1,), np.zeros(2), np.array([True]))
+    for rows in (np.array([True]), np.array([0, 1])):
+        with pytest.raises(ValueError, match=r"a boolean mask of shape \(2,\)"):
+            models.write("body_mass", (1,), np.zeros(2), rows)
+        with pytest.raises(ValueError, match=r"a boolean mask of shape \(2,\)"):
+            models.refresh(rows)
 
 
 def test_repeated_physics_step_as_the_ones_they_repeat():

@@ -8,6 +8,8 @@ from torchrl_bayessim.errors import SimulationError
 
 BOX = "<body pos='{} {} 1.3'><freejoint/><geom type='box' size='.1 .1 .1'/></body>"
 
+BALL = "<body><freejoint/><geom size='.1'/></body>"
+
 
 def falling_boxes(memory):
     """Sixteen boxes that land after 0.5 s, when contacts and constraints need room."""
@@ -98,3 +100,32 @@ def test_a_diverged_open_loop_leaves_the_whole_state_as_it_was():
     assert np.isfinite(after[0, 0]).all()  # it went well at first
     np.testing.assert_array_equal(stepper.state[0], before[0])
     assert (stepper["weld_pose"][1] != before[1, -7:]).any()
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"rows": np.array([0, 3])}, r"integers of 3 simulations, got \[0, 3\]"),
+        ({"rows": np.array([-1])}, r"integers of 3 simulations, got \[-1\]"),
+        ({"sequence": np.array([0, 1, 2])}, r"integers of 2 sequences of commands"),
+        ({"sequence": np.array([0, 1])}, r"a sequence for each of 3, got \(2,\)"),
+        ({"outputs": np.zeros((3, 5, 14))}, r"outputs of doubles, shape \(3, …\)"),
+        ({"outputs": np.zeros((2, 4, 13))}, r"outputs of doubles, shape \(3, …\)"),
+    ],
+)
+def test_compiled_code_is_given_only_what_is_there(change, match):
+    xml = f"<mujoco><worldbody>{BALL}</worldbody></mujoco>"
+    stepper = Stepper(mujoco.MjModel.from_xml_string(xml), 3)
+    given = {"sequence": np.array([0, 1, 0])} | change
+    with pytest.raises(ValueError, match=match):
+        stepper.rollout(np.zeros((2, 4, 0)), substeps=1, **given)
+
+
+def test_shared_physics_must_divide_the_simulations():
+    with pytest.raises(ValueError, match="sharing to divide the number of simulations, 3, got 2"):
+        Stepper(falling_boxes("1M"), 3, sharing=2)
+
+
+def test_an_output_is_read_once():
+    with pytest.raises(ValueError, match="outputs, each once"):
+        Stepper(falling_boxes("1M"), 1, outputs=("qpos", "qpos"))

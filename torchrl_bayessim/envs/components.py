@@ -1,13 +1,42 @@
-"""Components of start states and choices of environments, as they come from users."""
+"""What states are made of; start states and choices of environments as they come from users."""
 
 from __future__ import annotations
 
-__all__ = ["chosen_rows", "finite_rows"]
+__all__ = ["chosen_rows", "components_of", "finite_rows"]
 
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import message
+
+_COMPONENTS = (
+    "time",
+    "qpos",
+    "qvel",
+    "act",
+    "history",
+    "warmstart",
+    "ctrl",
+    "qfrc_applied",
+    "xfrc_applied",
+    "eq_active",
+    "mocap_pos",
+    "mocap_quat",
+    "userdata",
+    "plugin",
+)
+
+
+def components_of(model: mujoco.MjModel, *, welded: bool) -> dict[str, slice]:
+    """Return where each component is in a state."""
+    sizes = {name: mujoco.mj_stateSize(model, 1 << i) for i, name in enumerate(_COMPONENTS)}
+    if welded:
+        sizes["weld_pose"] = 7
+    ends = np.cumsum(list(sizes.values())).tolist()
+    return {
+        name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)
+    }
 
 
 def finite_rows(name: str, value: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:

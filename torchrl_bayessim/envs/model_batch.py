@@ -24,48 +24,12 @@ from ..physics.frames import separate, unskip
 from ..physics.geom_bounds import fit_bounds
 from . import native
 from .addresses import SCALARS, address, attribute
-from .fatal_errors import FAULT_SIZE, fault_text
+from .components import chosen_rows
+from .fatal_errors import fault_text
+from .scratch import Scratch, derived_places
 
-# What mj_setConst derives from masses, inertias and geometry (engine_setconst.c); the visual
-# constants of cameras and lights, which it recomputes too, do not enter the dynamics.
-_DERIVED = (
-    "body_subtreemass",
-    "body_invweight0",
-    "dof_invweight0",
-    "dof_M0",
-    "tendon_length0",
-    "tendon_invweight0",
-    "actuator_acc0",
-    "actuator_length0",
-    "stat.meaninertia",
-)
 _Place = tuple[str, tuple[int, ...]]
 _SHARE = 32  # environments that are worth another thread
-
-
-def _derived(model: mujoco.MjModel) -> list[_Place]:
-    """Return the numbers that mj_setConst derives: also where loops close (``eq_data``)."""
-    places: list[_Place] = []
-    for field in _DERIVED:
-        shape = () if field in SCALARS else np.shape(attribute(model, field))
-        places += [(field, indices) for indices in np.ndindex(shape)]
-    connects = model.eq_type == mujoco.mjtEq.mjEQ_CONNECT
-    connects &= model.eq_objtype == mujoco.mjtObj.mjOBJ_BODY
-    rows = np.flatnonzero(connects).tolist()
-    return places + [("eq_data", (row, column)) for row in rows for column in (3, 4, 5)]
-
-
-class _Scratch:
-    """What one thread refreshes with: a model and data of its own."""
-
-    def __init__(self, model: mujoco.MjModel) -> None:
-        self.model = copy.copy(model)
-        self.data = mujoco.MjData(self.model)
-        self.fault = np.zeros(FAULT_SIZE, dtype=np.uint8)
-        addresses = self.fault.ctypes.data, self.model._address, self.data._address
-        self.owned = np.array(addresses, dtype=np.int64)
-        self.columns = np.empty(0, dtype=np.int64)  # addresses of the table's columns
-        self.derived = self.columns  # which columns are derived from others
 
 
 class ModelBatch:
@@ -98,7 +62,7 @@ class ModelBatch:
         self._columns: dict[_Place, int] = {}
         self._bounding: list[_Place] = []  # those that `fit_bounds` looks at
         self._places: dict[Assignments, NDArray[np.int64]] = {}
-        self._scratch: list[_Scratch] = []
+        self._scratch: list[Scratch] = []
         self._pool: ThreadPoolExecutor | None = None
 
     def write(
@@ -128,9 +92,9 @@ class ModelBatch:
         if values.shape != (self.num_envs,):
             expected = f"one value per environment, shape ({self.num_envs},)"
             raise ValueError(message(expected, values.shape))
-        if rows is not None and np.shape(rows) != (self.num_envs,):
-            expected = f"a mask of environments, shape ({self.num_envs},)"
-            raise ValueError(message(expected, np.shape(rows)))
+        if rows is not None:
+            rows = np.asarray(rows)
+            chosen_rows(rows, self.num_envs)
         if (field, indices) not in self._columns:
             self._nominal(field, indices)  # or an error that says what there is
             check_settable(self.model, field, indices)
@@ -199,22 +163,23 @@ class ModelBatch:
 
         Raises:
             PhysicsError: A quaternion is not of unit length.
+            ValueError: ``rows`` is no mask of the environments.
             SimulationError: MuJoCo cannot evaluate the physics of an environment.
         """
+        selected = chosen_rows(rows, self.num_envs)
         if not self._scratch:
-            self._scratch.append(_Scratch(self.model))
-            for place in _derived(self.model):
+            self._scratch.append(Scratch(self.model))
+            for place in derived_places(self.model):
                 self.column(*place)
         if self._bounding:
             mask = np.ones(self.num_envs, dtype=bool) if rows is None else np.asarray(rows)
             fit_bounds(self, list(self._bounding), mask)
-        selected = np.arange(self.num_envs) if rows is None else np.flatnonzero(rows)
         threads = min(self.threads, len(selected) // _SHARE)
         if threads < 2:
             self._refresh(0, selected)
             return
         while len(self._scratch) < threads:
-            self._scratch.append(_Scratch(self.model))
+            self._scratch.append(Scratch(self.model))
         if self._pool is None:
             self._pool = ThreadPoolExecutor(self.threads - 1)
         first, *others = np.array_split(selected, threads)
@@ -227,7 +192,7 @@ class ModelBatch:
         scratch = self._scratch[thread]
         if len(scratch.columns) != len(self._columns):
             scratch.columns = self.addresses(scratch.model)
-            columns = [self._columns[place] for place in _derived(self.model)]
+            columns = [self._columns[place] for place in derived_places(self.model)]
             scratch.derived = np.array(columns, dtype=np.int64)
         columns, derived = scratch.columns, scratch.derived
         bad = native.refresh(scratch.owned, rows, self.table, columns, derived)

@@ -17,14 +17,11 @@ The arguments of the kernels, as `Stepper` builds them:
   per ``sharing`` environments; ``signature`` says what a state holds, and with a weld it ends in
   the last known pose of the body that follows the mocap body;
 * ``drive``: ``(relative, weld, pinned, site_ids, contact_forces)``, see `Drive`;
-* ``queue``: one integer, zero at the start, shared by the threads;
-* ``rows``: the environments to treat;
+* ``queue``: one integer, zero at the start, shared by the threads; ``rows``: the environments;
 * ``outputs``: where to write what was read;
-* ``status``: where to write what became of each environment: 0, or one of
-
-  * `DIVERGED`: a number is not finite or too large, by MuJoCo's own tests;
-  * `OVERFLOW`: contacts or constraints did not fit in the model's memory;
-  * `FAILED`: MuJoCo gave a fatal error, see `fatal_errors`.
+* ``status``: where to write what became of each environment: 0, or `DIVERGED` (too large a number,
+  by MuJoCo's own tests), `OVERFLOW` (contacts or constraints did not fit in the model's memory) or
+  `FAILED` (MuJoCo gave a fatal error, see `fatal_errors`).
 """
 # ruff: noqa: ANN001, ANN201, ANN202, PLR0917 - numba infers types and takes no keywords
 
@@ -92,8 +89,7 @@ def override(addresses, table, i):
 def assign(table, rows, theta, places, numbers):
     """Write the entries of ``rows``, a mask, that follow from parameters; see `Assignments`.
 
-    Nothing is written if a value is not finite or too small; then the first such row and number
-    are returned, else -1 and -1.
+    If a value is not finite or too small, nothing is written, and its row and number are returned.
     """
     for write in (False, True):
         for i in range(rows.shape[0]):

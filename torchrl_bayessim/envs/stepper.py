@@ -20,28 +20,13 @@ from numpy.typing import NDArray
 
 from ..errors import SimulationError, message
 from . import native
+from .components import components_of
 from .drive import Drive, resolved
 from .fatal_errors import fault_text
 from .model_batch import ModelBatch
 from .worker import Worker, layout
 
 _SIGNATURE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-_COMPONENTS = (
-    "time",
-    "qpos",
-    "qvel",
-    "act",
-    "history",
-    "warmstart",
-    "ctrl",
-    "qfrc_applied",
-    "xfrc_applied",
-    "eq_active",
-    "mocap_pos",
-    "mocap_quat",
-    "userdata",
-    "plugin",
-)
 
 
 class Stepper:
@@ -69,7 +54,8 @@ class Stepper:
 
     Raises:
         ValueError: ``drive.weld`` names a body, but the model has no mocap body; ``outputs`` names
-            what cannot be read; the model lets bodies sleep.
+            what cannot be read, or something twice; the model lets bodies sleep; ``sharing`` does
+            not divide ``num_envs``.
 
     Attributes:
         models: The physics of each simulation.
@@ -90,6 +76,9 @@ class Stepper:
         sharing: int = 1,
         threads: int | None = None,
     ) -> None:
+        if sharing < 1 or num_envs % sharing:
+            expected = f"sharing to divide the number of simulations, {num_envs}"
+            raise ValueError(message(expected, sharing))
         if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
             expected = "a model whose bodies never sleep, since sleep is not part of a state"
             hint = "model.opt.enableflags &= ~mujoco.mjtEnableBit.mjENBL_SLEEP"
@@ -107,7 +96,7 @@ class Stepper:
         self.command_size = model.nu + (0 if drive.weld is None else 7)
         self.layout = layout(self._workers[0].data, arrays + tuple(sites))
         self.output_size = sum(int(np.prod(shape)) for _, shape in self.layout.values())
-        self.components = _components(model, welded=drive.weld is not None)
+        self.components = components_of(model, welded=drive.weld is not None)
         self.initial = np.zeros(max(part.stop for part in self.components.values()))
         size = mujoco.mj_stateSize(model, _SIGNATURE)
         data = mujoco.MjData(model)
@@ -162,8 +151,9 @@ class Stepper:
         Raises:
             SimulationError: The model has too little memory, or cannot be evaluated at all.
         """
-        rows = self._all if rows is None else rows
+        rows = self._all if rows is None else _within(rows, self.num_envs, "simulations")
         outputs = self.outputs[:, 0] if outputs is None else outputs
+        _check_room(outputs, rows, (self.output_size,))
         self._run(native.begin, rows, outputs)
 
     def rollout(
@@ -190,7 +180,8 @@ class Stepper:
             rows that were not advanced.
 
         Raises:
-            ValueError: ``commands`` has another shape.
+            ValueError: ``commands`` or ``outputs`` has another shape; ``rows`` or ``sequence``
+                names what there is not.
             SimulationError: The model has too little memory, or MuJoCo gave another fatal error;
                 the environments that are named are as before, the others have advanced.
         """
@@ -199,8 +190,13 @@ class Stepper:
             raise ValueError(message(expected, commands.shape))
         if outputs is None:
             outputs = np.empty((self.num_envs, commands.shape[1], self.output_size))
-        rows = self._all if rows is None else rows
-        sequence = self._all if sequence is None else sequence
+        rows = self._all if rows is None else _within(rows, self.num_envs, "simulations")
+        _check_room(outputs, rows, (commands.shape[1], self.output_size))
+        sequence = self._all if sequence is None else np.asarray(sequence, dtype=np.int64)
+        if sequence.shape != (self.num_envs,) and len(sequence) <= rows.max(initial=-1):
+            raise ValueError(message(f"a sequence for each of {self.num_envs}", sequence.shape))
+        _within(sequence[rows], len(commands), "sequences of commands")
+        commands = np.asarray(commands, dtype=np.float64)
         self._run(native.advance, rows, outputs, commands, sequence, substeps)
         return outputs
 
@@ -246,12 +242,18 @@ class Stepper:
         raise SimulationError(message(expected, f"environments {full} without", hint=hint))
 
 
-def _components(model: mujoco.MjModel, *, welded: bool) -> dict[str, slice]:
-    """Return where each component is in a state."""
-    sizes = {name: mujoco.mj_stateSize(model, 1 << i) for i, name in enumerate(_COMPONENTS)}
-    if welded:
-        sizes["weld_pose"] = 7
-    ends = np.cumsum(list(sizes.values())).tolist()
-    return {
-        name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)
-    }
+def _within(rows: NDArray[np.int64], count: int, what: str) -> NDArray[np.int64]:
+    """Return integers below ``count``: compiled code does not look whether they are."""
+    rows = np.asarray(rows, dtype=np.int64)
+    if rows.ndim != 1 or (rows.size and not 0 <= rows.min() <= rows.max() < count):
+        raise ValueError(message(f"integers of {count} {what}", rows.tolist()))
+    return rows
+
+
+def _check_room(
+    outputs: NDArray[np.float64], rows: NDArray[np.int64], shape: tuple[int, ...]
+) -> None:
+    count = rows.max(initial=-1) + 1
+    if outputs.shape[1:] != shape or len(outputs) < count or outputs.dtype != np.float64:
+        expected = f"outputs of doubles, shape ({count}, …) with {shape} after it"
+        raise ValueError(message(expected, outputs.shape))

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import message
+from .components import components_of
 from .draws import Draws
 from .drive import Drive
 
@@ -79,6 +80,10 @@ class Task:
         command: ``action (*batch, A) -> (*batch, C)``; default the action itself.
         bounds: Lowest and highest action, shape ``(A,)`` each; default those of the actuators.
         initial: Components of the state at the start of every episode, before ``reset``.
+
+    Raises:
+        ValueError: ``frame_skip`` is not a positive integer.
+        KeyError: ``initial`` has something that is no component of the state.
     """
 
     model: mujoco.MjModel
@@ -93,6 +98,14 @@ class Task:
     command: Callable[[Tensor], Tensor] | None = None
     bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
     initial: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.frame_skip, int) or self.frame_skip < 1:
+            raise ValueError(message("frame_skip to be a positive integer", self.frame_skip))
+        known = components_of(self.model, welded=self.drive.weld is not None)
+        for name in self.initial:
+            if name not in known:
+                raise KeyError(message("a component of the state", name, available=known))
 
     @property
     def dt(self) -> float:

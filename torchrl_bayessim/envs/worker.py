@@ -25,10 +25,12 @@ class Worker:
         outputs: Arrays of ``MjData`` to read.
 
     Raises:
-        ValueError: There is no such array of a size that does not change.
+        ValueError: There is no such array of a size that does not change, or one is named twice.
     """
 
     def __init__(self, model: mujoco.MjModel, outputs: tuple[str, ...]) -> None:
+        if len(set(outputs)) != len(outputs):
+            raise ValueError(message("outputs, each once", outputs))
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
         self.jacobian = np.empty((6, model.nv))
