@@ -5,6 +5,7 @@ from torchrl.envs import Compose, GymEnv, TransformedEnv, check_env_specs
 
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.physics.conformance import PhysicsTests
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
 from torchrl_bayessim.transforms import ApplyEffect, ApplyPhysics, DomainRandomizer, EffectPhysics
 
@@ -93,3 +94,38 @@ def test_targets_that_differ_stay_so_until_one_strength_is_written():
     assert force.strength.tolist() == [0.0, 0.5]
     env.reset(env.full_state_spec.zero().set("theta", torch.tensor([0.25])))
     assert force.strength.tolist() == [0.25, 0.25]
+
+
+class OwnPhysics:
+    """An `EffectPhysics` belongs to the environment of its transforms: this finds it there."""
+
+    names = ("body_mass[pole]", "coulomb_friction[hinge]", "action_delay[slide]")
+
+    def write(self, env, theta, *, mask, tensordict):
+        own = env.__dict__["own_physics"]
+        own.write(env.base_env, theta, mask=mask, tensordict=tensordict)
+
+    def read(self, env, *, tensordict):
+        return env.__dict__["own_physics"].read(env.base_env, tensordict=tensordict)
+
+
+class TestConformance(PhysicsTests):
+    physics = OwnPhysics()
+    low, high = (3.0, 0.0, 0.0), (6.0, 0.4, 0.1)
+
+    def make_simulator(self):
+        return GymEnv(NAME)
+
+    def make_env(self):
+        friction, delay = ApplyEffect("coulomb_friction", 0.0), ApplyEffect("action_delay", 0.0)
+        env = TransformedEnv(self.make_simulator(), Compose(friction, delay))
+        strengths = (friction, "hinge"), (delay, "slide")
+        own = EffectPhysics(MujocoPhysics("body_mass[pole]"), *strengths)
+        assert own.names == OwnPhysics.names
+        env.__dict__["own_physics"] = own
+        return env
+
+
+class TestConformanceInABatch(TestConformance):
+    def make_simulator(self):
+        return BatchedMujocoEnv(NAME, 2, threads=1)

@@ -14,10 +14,17 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from ..effects.effect import Effect
+from ..effects.robot import Robot
+from ..effects.units import unit_at
+from ..errors import message
+from ..inference.priors import BoxPrior
+from ..physics.protocol import Physics
 from ..transforms.apply_effect import ApplyEffect
+from ..transforms.apply_physics import ApplyPhysics
+from ..transforms.effect_physics import EffectPhysics
 
 Verdict = Literal["none", "named", "named_partial", "ambiguous", "unknown", "not_testable"]
 
@@ -198,15 +205,75 @@ class Report:
         text = json.dumps(_plain(self.to_dict()), indent=1, allow_nan=False)
         Path(path).write_text(text, encoding="utf-8")
 
-    def apply(self, env: EnvBase) -> EnvBase:
+    def apply(self, env: EnvBase, physics: Physics | None = None) -> EnvBase:
         """Return the environment with the effects that were found.
+
+        With ``physics``, strengths are parameters too: the environment's θ has the columns of
+        ``physics``, then one for each strength, in the order of `prior`. A reset without θ brings
+        back the nominal parameters and the fitted strengths.
 
         Args:
             env: An environment of the simulator that was diagnosed.
+            physics: Its parameters; default none, and strengths stay as they were fitted.
         """
-        for effect, strength in self.strengths.items():
-            env = TransformedEnv(env, ApplyEffect(effect, dict(strength)))
-        return env
+        effects = [ApplyEffect(effect, dict(s)) for effect, s in self.strengths.items()]
+        if physics is None:
+            for effect in effects:
+                env = TransformedEnv(env, effect, auto_unwrap=True)
+            return env
+        pairs = zip(effects, self.strengths.values(), strict=True)
+        columns = [(effect, target) for effect, by_target in pairs for target in by_target]
+        if columns:
+            physics = EffectPhysics(physics, *columns)
+        chain: list[Any] = [ApplyPhysics(physics), *effects]
+        return TransformedEnv(env, Compose(*chain), auto_unwrap=True)
+
+    def prior(self, prior: BoxPrior | None, robot: Robot) -> BoxPrior:
+        """Return the prior over parameters and strengths of an environment of `apply`.
+
+        A strength is uniform over what the catalogue has as plausible on this robot, or twice that
+        where the fit lies beyond. The interval of the diagnosis does not narrow it: the same logs
+        would count twice.
+
+        Args:
+            prior: Over the parameters; ``None`` if there are none.
+            robot: Such as `System.robot`.
+
+        Raises:
+            TypeError: The prior is another than a `BoxPrior`.
+            ValueError: There are neither parameters nor effects.
+
+        Example::
+
+            theta = report.prior(system.prior, system.robot)  # …, action_delay[motor]
+            env = report.apply(env, system.physics)
+            env.append_transform(DomainRandomizer(theta))
+        """
+        bounds, log, units = _described(prior)
+        for effect, by_target in self.strengths.items():
+            targets = effect.targets(robot)
+            low, high = (bound.tolist() for bound in effect.bounds(robot))
+            for target, strength in by_target.items():
+                name, i = f"{effect.name}[{target}]", targets.index(target)
+                reach = 1.0 if low[i] <= strength <= high[i] else 2.0
+                bounds.append((name, (reach * low[i], reach * high[i])))
+                units[name] = unit_at(effect, robot, i)
+        return BoxPrior(bounds, log=log, units=units)
+
+
+def _described(
+    prior: BoxPrior | None,
+) -> tuple[list[tuple[str, tuple[float, float]]], list[str], dict[str, str]]:
+    """Return what a prior was made of: bounds, names of logarithmic parameters, units."""
+    if prior is None:
+        return [], [], {}
+    if not isinstance(prior, BoxPrior):
+        hint = "the bounds that the diagnosis started from"
+        raise TypeError(message("a BoxPrior", type(prior).__name__, hint=hint))
+    box = zip(prior.low.tolist(), prior.high.tolist(), strict=True)
+    log = [name for name, flag in zip(prior.names, prior.log.tolist(), strict=True) if flag]
+    units = dict(zip(prior.names, prior.units, strict=True))
+    return list(zip(prior.names, box, strict=True)), log, units
 
 
 def _plain(value: Any) -> Any:
