@@ -233,9 +233,71 @@ def test_bad_calls_are_refused():
         model(torch.zeros(2, 2))
     with pytest.raises(ValueError, match=r"P at least 1, .*got \(0, 1\)"):
         model(torch.zeros(0, 1))
+    with pytest.raises(ValueError, match=r"got \(1,\). Try: theta\[None\] for a single vector"):
+        model(torch.zeros(1))
+    with pytest.raises(ValueError, match=r"physics, to say what theta sets, got 'none'"):
+        Replay(slider(), pushes())(torch.zeros(1, 1))
     with pytest.raises(ValueError, match="every='control', or 'time'"):
         model(hook=lambda now: {}, every="day")
     with pytest.raises(KeyError, match=r"ctrl \(did you mean this\?\)"):
         model(hook=lambda now: {"ctr": now.ctrl})
     with pytest.raises(ValueError, match="segments with qpos, qvel and action"):
         replay(slider(), {"qpos": torch.zeros(1, 1)})
+
+
+def test_segments_are_copied():
+    segments = {name: value.double() for name, value in pushes().items()}
+    model = Replay(slider(), segments)
+    before = model()["qpos"]
+    for value in segments.values():
+        value.add_(1.0)
+    assert (model()["qpos"] == before).all()
+    arrays = {name: value.numpy() - 1.0 for name, value in segments.items()}
+    model = Replay(slider(), arrays)
+    before = model()["qpos"]
+    arrays["action"][:] = 7.0
+    assert (model()["qpos"] == before).all()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_parameters_that_are_not_finite_are_refused_and_nothing_is_written(bad):
+    """To `MujocoPhysics` NaN means nominal; in a fit it would pass for the robot's own physics."""
+    model = Replay(slider(), pushes(), physics=MujocoPhysics("dof_damping[x]"))
+    expected = model(torch.tensor([[3.0], [4.0]]))["qpos"]
+    with pytest.raises(
+        ValueError, match=rf"finite parameters, in row 1 .*dof_damping\[x\] = {bad}"
+    ):
+        model(torch.tensor([[1.0], [bad]]))
+    assert (model()["qpos"][0] == expected[0]).all()
+
+
+def test_parameters_may_be_arrays_and_need_a_gradient():
+    model = Replay(slider(), pushes(), physics=MujocoPhysics("dof_damping[x]"))
+    theta = torch.tensor([[3.0], [4.0]], requires_grad=True)
+    expected = model(theta.detach())["qpos"]
+    for given in (theta, theta.detach().numpy(), [[3.0], [4.0]], torch.tensor([[3], [4]])):
+        assert (model(given)["qpos"] == expected).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "match"),
+    [
+        (
+            {"outputs": "qpos"},
+            TypeError,
+            r"a tuple of names of outputs, got 'qpos'. Try: \('qpos',",
+        ),
+        ({"threads": 0}, ValueError, "threads to be a positive integer, got 0"),
+        ({"threads": -1}, ValueError, "threads to be a positive integer, got -1"),
+        ({"dt": np.nan}, ValueError, "dt to be a multiple of .*, got nan"),
+        ({"dt": np.inf}, ValueError, "dt to be a multiple of .*, got inf"),
+    ],
+)
+def test_bad_settings_are_refused(change, error, match):
+    with pytest.raises(error, match=match):
+        Replay(slider(), pushes(), **change)
+
+
+def test_a_replay_is_of_a_task():
+    with pytest.raises(TypeError, match=r"got 'MjModel'. Try: Task\(model=..., frame_skip=...\)"):
+        Replay(slider().model, pushes())

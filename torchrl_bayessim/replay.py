@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
-from .envs.components import finite_rows
+from .envs.components import check_counts, finite_rows, names_of
 from .envs.draws import Draws
 from .envs.model_batch import ModelBatch
+from .envs.segments import checked_actions, copies, substeps_of, vectors
 from .envs.stepper import Stepper
 from .envs.task import Readings, Task
-from .envs.tasks.catalogue import known_task
+from .envs.tasks.catalogue import as_task
 from .errors import message
 from .physics.protocol import Physics
 
@@ -62,9 +63,9 @@ class Replay:
         segments: ``action``, shape ``(S, T, A)``, each held for ``dt`` seconds, and the components
             of the start states, shape ``(S, size)``: ``qpos``, ``qvel`` and where known ``act``,
             ``time``, ``warmstart``, ``mocap_pos``, ``mocap_quat``; the others start at the model's
-            defaults. A tensordict will do. Fetch also needs ``weld_pose``, from which the next
-            action moves the hand: ``xpos`` and ``xquat`` of ``robot0:gripper_link``, as they stood
-            in ``MjData`` when the start state was recorded.
+            defaults. All are copied. A tensordict will do. Fetch also needs ``weld_pose``, from
+            which the next action moves the hand: ``xpos`` and ``xquat`` of
+            ``robot0:gripper_link``, as they stood in ``MjData`` when the start was recorded.
         physics: What the columns of theta set; default nothing.
         outputs: Arrays of ``MjData`` to return, and ``observation`` for the task's observation.
         threads: Threads to step with; default all cores that this process may use.
@@ -73,7 +74,8 @@ class Replay:
 
     Raises:
         ValueError: The segments disagree in number, lack what they need, or are not finite;
-            ``dt`` is not a multiple of the time step.
+            ``dt`` is not a multiple of the time step; ``threads`` is no positive integer.
+        TypeError: ``task`` is none; ``outputs`` is one string.
 
     Attributes:
         task: The task.
@@ -92,19 +94,19 @@ class Replay:
         threads: int | None = None,
         dt: float | None = None,
     ) -> None:
-        self.task = known_task(task) if isinstance(task, str) else task
+        self.task = as_task(task)
         if dt is not None:
-            self.task = replace(self.task, frame_skip=_substeps(self.task, dt))
+            self.task = replace(self.task, frame_skip=substeps_of(self.task, dt))
         self.physics = physics
-        self._names = outputs
-        read = tuple(name for name in outputs if name != "observation")
-        if "observation" in outputs:
+        check_counts(threads=threads)
+        self._names = names_of(outputs)
+        read = tuple(name for name in self._names if name != "observation")
+        if "observation" in self._names:
             read += tuple(name for name in self.task.outputs if name not in read)
-        given = {key: torch.as_tensor(segments[key]).double() for key in segments.keys()}  # noqa: SIM118
-        action = _checked(given, self.task)
+        given = copies(segments)
+        action = checked_actions(given, self.task)
         self.num_segments, self.steps = action.shape[:2]
         # commands in the precision of the actions, as in an environment
-        action = torch.as_tensor(segments["action"])
         command = action if self.task.command is None else self.task.command(action)
         self._commands = command.to(torch.float64).contiguous().numpy()
         self._stepper = Stepper(
@@ -135,7 +137,8 @@ class Replay:
         """Simulate all segments under every parameter vector.
 
         Args:
-            theta: Parameter vectors, shape ``(P, D)``; default the physics in force.
+            theta: Parameter vectors, shape ``(P, D)``, without NaN (which to `MujocoPhysics` means
+                nominal); no gradient goes through them. Default the physics in force.
             hook: What the simulator leaves out.
             every: Call the hook before every ``control`` step, or before every ``time`` step.
 
@@ -144,7 +147,8 @@ class Replay:
             a divergence on.
 
         Raises:
-            ValueError: ``theta`` has another shape or no ``physics`` to set; ``every`` is unknown.
+            ValueError: ``theta`` has another shape, is not finite, or there is no ``physics`` to
+                set; ``every`` is unknown.
         """
         count = 1 if theta is None else self._write(theta)
         rows = np.arange(count * self.num_segments)
@@ -162,10 +166,11 @@ class Replay:
         return self._collect(outputs.reshape(count, self.num_segments, self.steps, -1))
 
     def _write(self, theta: Tensor) -> int:
-        names = () if self.physics is None else self.physics.names
-        if self.physics is None or theta.ndim != 2 or theta.shape != (len(theta) or 1, len(names)):
-            expected = f"theta of shape (P, {len(names)}), P at least 1, for the parameters {names}"
-            raise ValueError(message(expected, tuple(theta.shape), hint="pass physics"))
+        if self.physics is None:
+            expected = "physics, to say what theta sets"
+            hint = 'Replay(…, physics=MujocoPhysics("body_mass[torso]"))'
+            raise ValueError(message(expected, "none", hint=hint))
+        theta = vectors(theta, self.physics.names)
         count = len(theta)
         if count > self.models.num_envs:
             self._stepper.resize(count * self.num_segments)
@@ -259,34 +264,3 @@ def replay(
         True
     """
     return Replay(task, segments, physics=physics, outputs=outputs, dt=dt)(theta, hook=hook)
-
-
-def _substeps(task: Task, dt: float) -> int:
-    """Return how many time steps of the model are ``dt`` seconds."""
-    timestep = task.model.opt.timestep
-    count = round(dt / timestep)
-    if count < 1 or abs(count * timestep - dt) > 1e-6 * dt:
-        expected = f"dt to be a multiple of the model's time step, {timestep:g} s"
-        hint = f"{max(1, count) * timestep:g}, or a model of another time step"
-        raise ValueError(message(expected, dt, hint=hint))
-    return count
-
-
-def _checked(given: Mapping[str, Tensor], task: Task) -> Tensor:
-    """Return the actions of segments that are fit to be replayed."""
-    needed = {"qpos", "qvel", "action"}
-    if not needed <= given.keys():
-        raise ValueError(message("segments with qpos, qvel and action", sorted(given)))
-    if task.drive.weld is not None and "weld_pose" not in given:
-        expected = "segments with weld_pose, from which the next action steps"
-        hint = f"xpos and xquat of data.body({task.drive.weld!r}), as recorded with qpos"
-        raise ValueError(message(expected, sorted(given), hint=hint))
-    action = given["action"]
-    if action.ndim != 3 or not all(action.shape[:2]):
-        expected = "actions of shape (S, T, A), S and T at least 1"
-        raise ValueError(message(expected, tuple(action.shape)))
-    for name, value in given.items():
-        if len(value) != len(action) or not value.isfinite().all():
-            expected = f"finite numbers for {len(action)} segments in {name!r}"
-            raise ValueError(message(expected, tuple(value.shape)))
-    return action

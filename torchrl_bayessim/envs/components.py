@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-__all__ = ["chosen_rows", "components_of", "finite_rows"]
+__all__ = ["check_counts", "chosen_rows", "components_of", "finite_rows", "names_of"]
+
+from collections.abc import Iterable
+from numbers import Integral
 
 import mujoco
 import numpy as np
@@ -73,3 +76,30 @@ def chosen_rows(mask: ArrayLike | None, count: int) -> NDArray[np.int64]:
         expected = f"a boolean mask of shape ({count},)"
         raise ValueError(message(expected, f"{array.dtype} of shape {array.shape}"))
     return np.flatnonzero(array)
+
+
+def check_counts(**counts: object) -> None:
+    """Refuse counts that are not positive integers; None stands for a default.
+
+    Example:
+        >>> check_counts(num_envs=np.int64(4), threads=None)
+
+    Raises:
+        ValueError: One of them is not.
+    """
+    for name, value in counts.items():
+        if value is not None and not (
+            isinstance(value, Integral) and not isinstance(value, bool) and value > 0
+        ):
+            raise ValueError(message(f"{name} to be a positive integer", value))
+
+
+def names_of(outputs: Iterable[str]) -> tuple[str, ...]:
+    """Return names as a tuple.
+
+    Raises:
+        TypeError: ``outputs`` is one string, whose letters are no names.
+    """
+    if isinstance(outputs, str):
+        raise TypeError(message("a tuple of names of outputs", outputs, hint=f"({outputs!r},)"))
+    return tuple(outputs)

@@ -47,7 +47,8 @@ class MujocoPhysics:
         **aliases: A name for an entry, or for several that are all set to one value.
 
     Where a parameter's entries hold different values, as they may in the nominal model, `read`
-    gives NaN, and writing that NaN restores each to its own nominal value.
+    gives NaN, and writing NaN restores each to its own nominal value: to this class NaN means
+    nominal, wherever it comes from. `Replay` refuses it.
 
     Raises:
         TypeError: A target is not a string.

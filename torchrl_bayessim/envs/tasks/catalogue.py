@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["TASKS", "known_task"]
+__all__ = ["TASKS", "as_task", "known_task"]
 
 from collections.abc import Callable
 from functools import partial
@@ -44,6 +44,21 @@ def known_task(name: str) -> Task:
         ValueError: There is none; the message lists near names.
     """
     if name not in TASKS:
-        hint = "pass a Task for a model of your own"
+        hint = "Task(model=mujoco.MjModel.from_xml_path(…), frame_skip=…) for a model of your own"
         raise ValueError(message("a known task", name, available=TASKS, hint=hint))
     return TASKS[name]()
+
+
+def as_task(task: object) -> Task:
+    """Return a task as it is, or the one of this name.
+
+    Raises:
+        TypeError: It is neither, such as a bare model.
+        ValueError: There is no task of this name.
+    """
+    if isinstance(task, str):
+        return known_task(task)
+    if not isinstance(task, Task):
+        hint = "Task(model=..., frame_skip=...) for a model of your own"
+        raise TypeError(message("a task or the name of one", type(task).__name__, hint=hint))
+    return task
