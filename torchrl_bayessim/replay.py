@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -87,7 +87,7 @@ class Replay:
     def __init__(
         self,
         task: str | Task,
-        segments: Mapping[str, Tensor],
+        segments: Mapping[str, ArrayLike],
         *,
         physics: Physics | None = None,
         outputs: tuple[str, ...] = ("qpos", "qvel"),
@@ -132,7 +132,7 @@ class Replay:
         return torch.Size([self.models.num_envs])
 
     def __call__(
-        self, theta: Tensor | None = None, *, hook: Hook | None = None, every: str = "control"
+        self, theta: ArrayLike | None = None, *, hook: Hook | None = None, every: str = "control"
     ) -> TensorDict:
         """Simulate all segments under every parameter vector.
 
@@ -165,18 +165,18 @@ class Replay:
             )
         return self._collect(outputs.reshape(count, self.num_segments, self.steps, -1))
 
-    def _write(self, theta: Tensor) -> int:
+    def _write(self, theta: ArrayLike) -> int:
         if self.physics is None:
             expected = "physics, to say what theta sets"
             hint = 'Replay(…, physics=MujocoPhysics("body_mass[torso]"))'
             raise ValueError(message(expected, "none", hint=hint))
-        theta = vectors(theta, self.physics.names)
-        count = len(theta)
+        values = vectors(theta, self.physics.names)
+        count = len(values)
         if count > self.models.num_envs:
             self._stepper.resize(count * self.num_segments)
         room = self.models.num_envs
         mask = torch.arange(room) < count
-        padded = torch.cat([theta, theta[-1:].expand(room - count, -1)])
+        padded = torch.cat([values, values[-1:].expand(room - count, -1)])
         anything: Any = self  # what physics needs of an environment are its models
         empty = TensorDict(batch_size=self.batch_size)
         self.physics.write(anything, padded, mask=mask, tensordict=empty)
@@ -247,8 +247,8 @@ class Replay:
 
 def replay(
     task: str | Task,
-    segments: Mapping[str, Tensor],
-    theta: Tensor | None = None,
+    segments: Mapping[str, ArrayLike],
+    theta: ArrayLike | None = None,
     *,
     physics: Physics | None = None,
     outputs: tuple[str, ...] = ("qpos", "qvel"),

@@ -1,5 +1,7 @@
 """What follows from an entry follows, in one model and in many; the rest is refused."""
 
+import copy
+
 import mujoco
 import numpy as np
 import pytest
@@ -135,6 +137,31 @@ def test_a_loop_closes_where_the_moved_body_is():
         np.testing.assert_allclose(models.copy_of(i).eq_data, expected)
 
 
+def test_cloth_of_another_mass_hangs_as_in_a_model_of_its_own():
+    """The weight of an edge's constraint follows from the masses of its vertices."""
+    model = mujoco.MjModel.from_xml_string("""<mujoco><option timestep=".001"/><worldbody>
+    <flexcomp name="cloth" type="grid" count="4 4 1" spacing=".1 .1 .1" dim="2" mass="1"
+      radius=".01"><edge equality="true"/><pin id="0 3"/></flexcomp></worldbody></mujoco>""")
+    cloths = Stepper(model, 2, threads=1)
+    vertices = np.flatnonzero(model.body_mass)
+    physics = MujocoPhysics(mass=tuple(f"body_mass[{i}]" for i in vertices))
+    mass = model.body_mass.max()
+    write(Batched(cloths.models), physics, [mass], [5 * mass])
+    cloths.begin()
+    cloths.rollout(np.zeros((2, 1, 0)), substeps=200)
+    for i, factor in enumerate((1, 5)):
+        own = copy.copy(model)
+        own.body_mass *= factor
+        own.body_inertia *= factor
+        mujoco.mj_setConst(own, mujoco.MjData(own))
+        data = mujoco.MjData(own)
+        mujoco.mj_step(own, data, nstep=200)
+        np.testing.assert_array_equal(cloths["qpos"][i], data.qpos)
+    changed = cloths.models.read("flexedge_invweight0", (3,))
+    assert changed[1] == pytest.approx(changed[0] / 5)
+    assert (cloths["qpos"][0] != cloths["qpos"][1]).any()
+
+
 REFUSED = """<mujoco><worldbody>
   <geom name="floor" type="plane" size="1 1 1"/>
   <body name="ball"><joint name="x" type="slide"/><geom name="g" size=".1"/><site name="s"/></body>
@@ -176,7 +203,7 @@ class Single:
 
 class Batched:
     def __init__(self, model):
-        self._models = ModelBatch(model, 2)
+        self._models = model if isinstance(model, ModelBatch) else ModelBatch(model, 2)
         self.batch_size = (2,)
 
     @property

@@ -5,7 +5,6 @@ from __future__ import annotations
 __all__ = ["check_counts", "chosen_rows", "components_of", "finite_rows", "names_of"]
 
 from collections.abc import Iterable
-from numbers import Integral
 
 import mujoco
 import numpy as np
@@ -88,9 +87,9 @@ def check_counts(**counts: object) -> None:
         ValueError: One of them is not.
     """
     for name, value in counts.items():
-        if value is not None and not (
-            isinstance(value, Integral) and not isinstance(value, bool) and value > 0
-        ):
+        if value is None:
+            continue
+        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
             raise ValueError(message(f"{name} to be a positive integer", value))
 
 

@@ -23,6 +23,8 @@ _DERIVED = (
     "tendon_invweight0",
     "actuator_acc0",
     "actuator_length0",
+    "flexedge_length0",
+    "flexedge_invweight0",
     "stat.meaninertia",
 )
 

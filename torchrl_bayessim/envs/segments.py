@@ -8,13 +8,14 @@ import math
 from collections.abc import Mapping
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ..errors import message
 from .task import Task
 
 
-def copies(segments: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def copies(segments: Mapping[str, ArrayLike]) -> dict[str, Tensor]:
     """Return the components as tensors of our own: states in double, actions in their precision."""
     names = segments.keys()  # a tensordict's iterator goes through its rows
     given = {name: torch.as_tensor(segments[name]).detach().clone() for name in names}
@@ -62,7 +63,7 @@ def substeps_of(task: Task, dt: float) -> int:
     return count
 
 
-def vectors(theta: object, names: tuple[str, ...]) -> Tensor:
+def vectors(theta: ArrayLike, names: tuple[str, ...]) -> Tensor:
     """Return parameter vectors, shape ``(P, D)``, of the parameters ``names``.
 
     Example:

@@ -56,7 +56,8 @@ DERIVED_FROM = CONSTANTS | BOUNDS
 RESULTS = frozenset({
     "body_subtreemass", "body_invweight0", "body_margin", "dof_invweight0", "dof_M0",
     "dof_length", "geom_rbound", "geom_aabb", "bvh_aabb", "tendon_length0", "tendon_invweight0",
-    "actuator_acc0", "actuator_length0", "stat.meaninertia",
+    "actuator_acc0", "actuator_length0", "flexedge_length0", "flexedge_invweight0",
+    "stat.meaninertia",
 })  # fmt: skip
 _SIMPLE = {"body_ipos", "body_iquat", "jnt_pos", "jnt_axis"}
 _SPARSE = {"tendon_armature"}
