@@ -1,7 +1,10 @@
+import multiprocessing
+
 import mujoco
 import numpy as np
 import pytest
 
+from torchrl_bayessim.envs import native
 from torchrl_bayessim.envs.stepper import Stepper
 from torchrl_bayessim.envs.tasks.catalogue import known_task
 from torchrl_bayessim.errors import SimulationError
@@ -129,3 +132,51 @@ def test_shared_physics_must_divide_the_simulations():
 def test_an_output_is_read_once():
     with pytest.raises(ValueError, match="outputs, each once"):
         Stepper(falling_boxes("1M"), 1, outputs=("qpos", "qpos"))
+
+
+def test_a_forked_process_steps_and_refreshes_with_threads_of_its_own():
+    """It inherits none of its parent's, and would wait for them for ever."""
+    size = 128  # enough for threads to share a refresh
+    xml = f"<mujoco><worldbody>{BALL}</worldbody></mujoco>"
+    balls = Stepper(mujoco.MjModel.from_xml_string(xml), size, threads=2)
+
+    def fall():
+        balls.state[:] = balls.initial
+        balls.models.write("body_mass", (1,), np.linspace(1, 2, size))
+        balls.models.refresh()
+        balls.begin()
+        return balls.rollout(np.zeros((size, 3, 0)), substeps=1)
+
+    expected = fall()
+
+    def child():
+        np.testing.assert_array_equal(fall(), expected)
+
+    process = multiprocessing.get_context("fork").Process(target=child)
+    process.start()
+    process.join(timeout=60)
+    finished = process.exitcode
+    process.kill()
+    assert finished == 0
+    np.testing.assert_array_equal(fall(), expected)  # and the parent goes on
+
+
+def test_a_fatal_error_without_a_message_is_still_an_error():
+    stepper = Stepper(falling_boxes("1M"), 2, threads=1)
+    stepper.status[:] = native.FAILED, 0
+    with pytest.raises(
+        SimulationError, match=r"environments \[0\], got 'a fatal error without"
+    ):
+        stepper._raise_failures(np.arange(2))
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "match"),
+    [
+        ({"outputs": "qpos"}, TypeError, r"a tuple of names of outputs, got 'qpos'"),
+        ({"threads": 0}, ValueError, "threads to be a positive integer, got 0"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(change, error, match):
+    with pytest.raises(error, match=match):
+        Stepper(falling_boxes("1M"), 1, **change)

@@ -11,7 +11,6 @@ from __future__ import annotations
 __all__ = ["ModelBatch"]
 
 import copy
-from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
 import numpy as np
@@ -27,6 +26,7 @@ from .addresses import SCALARS, address, attribute
 from .components import chosen_rows
 from .fatal_errors import fault_text
 from .scratch import Scratch, derived_places
+from .threads import Threads
 
 _Place = tuple[str, tuple[int, ...]]
 _SHARE = 32  # environments that are worth another thread
@@ -63,7 +63,7 @@ class ModelBatch:
         self._bounding: list[_Place] = []  # those that `fit_bounds` looks at
         self._places: dict[Assignments, NDArray[np.int64]] = {}
         self._scratch: list[Scratch] = []
-        self._pool: ThreadPoolExecutor | None = None
+        self._pool = Threads(max(1, threads - 1))
 
     def write(
         self,
@@ -180,8 +180,6 @@ class ModelBatch:
             return
         while len(self._scratch) < threads:
             self._scratch.append(Scratch(self.model))
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(self.threads - 1)
         first, *others = np.array_split(selected, threads)
         futures = [self._pool.submit(self._refresh, i, part) for i, part in enumerate(others, 1)]
         self._refresh(0, first)

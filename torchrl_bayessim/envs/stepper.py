@@ -12,7 +12,6 @@ __all__ = ["Stepper"]
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
 import numpy as np
@@ -20,10 +19,11 @@ from numpy.typing import NDArray
 
 from ..errors import SimulationError, message
 from . import native
-from .components import components_of
+from .components import check_counts, components_of, names_of
 from .drive import Drive, resolved
 from .fatal_errors import fault_text
 from .model_batch import ModelBatch
+from .threads import Threads
 from .worker import Worker, layout
 
 _SIGNATURE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -53,16 +53,18 @@ class Stepper:
         threads: Threads to step with; default all cores that this process may use.
 
     Raises:
-        ValueError: ``drive.weld`` names a body, but the model has no mocap body; ``outputs`` names
-            what cannot be read, or something twice; the model lets bodies sleep; ``sharing`` does
-            not divide ``num_envs``.
+        TypeError: ``outputs`` is one string.
+        ValueError: ``num_envs`` or ``threads`` is no positive integer; ``drive.weld`` names a body,
+            but the model has no mocap body; ``outputs`` names what cannot be read, or something
+            twice; the model lets bodies sleep; ``sharing`` does not divide ``num_envs``.
 
     Attributes:
         models: The physics of each simulation.
         state: States, shape ``(N, S)``.
         components: Where ``qpos``, ``qvel``, … are in a state; ``stepper["qpos"]`` is a view.
         initial: The model's initial state, shape ``(S,)``.
-        status: Of the last call: 0, or `native.DIVERGED`, shape ``(N,)``.
+        status: What became of each simulation in the last call that included it: 0, or
+            `native.DIVERGED`, ``OVERFLOW`` or ``FAILED`` (which are errors too), shape ``(N,)``.
         command_size: Numbers in a command.
     """
 
@@ -76,6 +78,7 @@ class Stepper:
         sharing: int = 1,
         threads: int | None = None,
     ) -> None:
+        check_counts(num_envs=num_envs, threads=threads)
         if sharing < 1 or num_envs % sharing:
             expected = f"sharing to divide the number of simulations, {num_envs}"
             raise ValueError(message(expected, sharing))
@@ -84,12 +87,13 @@ class Stepper:
             hint = "model.opt.enableflags &= ~mujoco.mjtEnableBit.mjENBL_SLEEP"
             raise ValueError(message(expected, '<flag sleep="enable"/>', hint=hint))
         drive = Drive() if drive is None else drive
+        outputs = names_of(outputs)
         sites = [name for name in outputs if name.startswith("site_velocity[")]
         arrays = tuple(name for name in outputs if name not in sites)
         self._threads = threads or len(os.sched_getaffinity(0))
         self._hire = lambda: Worker(model, arrays)
         self._workers = [self._hire()]
-        self._pool = ThreadPoolExecutor(max(1, self._threads - 1))
+        self._pool = Threads(max(1, self._threads - 1))
         self._queue = np.zeros(1, dtype=np.int64)
         self._drive = resolved(model, drive, sites)
         self._sharing = sharing
@@ -228,14 +232,15 @@ class Stepper:
         if not (status > native.DIVERGED).any():
             return
         failed = rows[status == native.FAILED].tolist()
-        said = [text for text in (fault_text(worker.fault) for worker in self._workers) if text]
+        texts = (fault_text(worker.fault) for worker in self._workers)
+        said = next(filter(None, texts), "a fatal error without a message")
         for worker in self._workers:
             worker.fault[:] = 0
         if failed:
             expected = f"simulations that MuJoCo can compute, not environments {failed}"
-            memory = "stack" in said[0] or "memory" in said[0]
+            memory = "stack" in said or "memory" in said
             hint = "raise <size memory='…'/> in the MJCF" if memory else "check their physics"
-            raise SimulationError(message(expected, said[0], hint=hint))
+            raise SimulationError(message(expected, said, hint=hint))
         full = rows[status == native.OVERFLOW].tolist()
         expected = "room for all contacts and constraints"
         hint = "raise <size memory='…'/> in the MJCF"
