@@ -36,7 +36,7 @@ from .selection import Selection
 from .whitening import whitening
 
 Array = NDArray[np.float64]
-_SECONDS, _STEPS = 10.0, 400  # of one run, at most
+_SECONDS, _STEPS = 10.0, 200  # of one run, at most
 _AMPLITUDES = (1.0, 1.5)  # of the commands recorded so far
 _BEYOND = 0.25  # of the recorded range: how far a joint may leave it
 _RUNS = 3  # more are no proposal: what a model leaves out would decide, not the cause

@@ -26,7 +26,7 @@ _SURVIVORS, _FINALISTS = 7, 4  # that are fitted on all segments, and to the end
 _MANY, _APART, _MATTER = 150, 4, 8  # units, targets of one effect, effects to look at singly
 _FEW, _EVERY = 8, 4  # segments on which a round begins at least, and which share at least
 _BENT = 5.0  # mean squared innovation of a nominal fit that may have gone astray
-_PLAIN = 100.0  # and of one that leaves a gap which a few segments show
+_PLAIN = 300.0  # misfit beyond noise with which a few segments tell explanations apart
 _TYPICAL = (0.05, 0.2)  # of an effect's range, to start from
 _NEAR = 0.3  # prior standard deviations within which derivatives may hold
 
@@ -57,9 +57,10 @@ def compare(train: Objective, base: Fit, units: Sequence[Unit], *, glance: bool 
         train: The segments.
         base: What is in the model already.
         units: What may be missing.
-        glance: Look at some segments only; as it does anyway where the gap is large.
+        glance: Look at fewer segments, and at nothing on all; as where the gap is large.
     """
-    every = int(np.clip(round(len(train.segments) / _FEW), 1, _EVERY))
+    coarser = 2 if glance else 1
+    every = int(np.clip(round(coarser * len(train.segments) / _FEW), 1, coarser * _EVERY))
     thin, fit = train.thinned(every), base.thinned(every)
     if len(units) > _MANY:  # single ones only of the effects that matter
         counts = Counter(unit.name for unit in units)
@@ -68,7 +69,7 @@ def compare(train: Objective, base: Fit, units: Sequence[Unit], *, glance: bool 
         names = list(dict.fromkeys(unit.name for unit in best))[:_MATTER]
         units = [u for u in units if u in whole or u.name in names]
     coarse = screen(thin, fit, units)
-    if glance or every == 1 or _plain(base):
+    if glance or every == 1 or _plain(fit):
         return Round(base, coarse.grown(every), thin, coarse, every)
     first = list(coarse.best(1.0))[:_MATTER]
     together = [unit for on in [*pairs(coarse), *groups(coarse)] for unit in on]
@@ -98,8 +99,9 @@ def explanations(train: Objective, now: Round) -> list[Fit]:
         for point in _spread(fit, train.predictor.system.robot)
     ]
     tried += refit(now.thin, everywhere, iterations=3, renew=False)
-    if _plain(base):
-        return refit(train, [fit.point for fit in _fittest(tried, _FINALISTS, alike=1)])
+    if _plain(base.thinned(now.every)):
+        best = _fittest(tried, _FINALISTS, alike=1)
+        return refit(train, [fit.point for fit in best], race=np.inf)
     starts = [fit.point for fit in _fittest(tried, _SURVIVORS)]
     known: list[Fit | None] = []
     for point in starts:
@@ -108,7 +110,7 @@ def explanations(train: Objective, now: Round) -> list[Fit]:
         known.append(now.seen.origin(base, on) if near else None)
     tried = refit(train, starts, origins=known, iterations=2, renew=False)
     best = _fittest(tried, _FINALISTS, alike=1)
-    return refit(train, [fit.point for fit in best], origins=best)
+    return refit(train, [fit.point for fit in best], origins=best, race=np.inf)
 
 
 def _starts(now: Round) -> tuple[list[Point], list[Fit | None]]:
@@ -169,8 +171,8 @@ def bent(fit: Fit) -> bool:
 
 
 def _plain(fit: Fit) -> bool:
-    """Return whether so much is left that a few segments say enough."""
-    return bool((fit.innovations**2).mean() > _PLAIN)
+    """Return whether so much is left that the segments of the fit say enough."""
+    return bool(fit.misfit - fit.innovations.size > _PLAIN)
 
 
 def _promise(fit: Fit) -> float:

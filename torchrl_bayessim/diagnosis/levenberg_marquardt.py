@@ -5,7 +5,8 @@ step taught (Broyden 1965)::
 
     J ← J + (Δr − J Δx) Δxᵀ / ‖Δx‖²,
 
-and made anew only where a step fails that they had promised, or at the end.
+and made anew only where a step fails that they had promised, or at the end unless the last step
+kept its promise.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ Array = NDArray[np.float64]
 _STEP = 0.01  # of a prior standard deviation, and of an effect's range
 _CAREFUL = (3.0, 100.0)  # dampings tried after a step that failed, times the one before
 _STUCK = 1e4  # damping beyond which there is nothing to gain
+_LITTLE = 1e-3, 1e-4  # gains that end a descent: absolute, and of the cost
+_KEPT = 0.25  # of a promise: by how much a gain may differ from it where derivatives are right
 
 
 class LevenbergMarquardt:
@@ -38,6 +41,8 @@ class LevenbergMarquardt:
         vector: The best point so far.
         residual: ``r`` there, of any shape with ``m`` numbers.
         jacobian: Its derivative, shape ``(m, n)``, approximately.
+        cost: What it minimises, there.
+        gain: By how much the last step made it smaller; infinite before the first.
         done: Whether nothing more is to be gained.
     """
 
@@ -57,8 +62,9 @@ class LevenbergMarquardt:
         self._asked: list[Array] = []
         self._origin = origin
         self._stage = "begin"
-        self._fresh = self._settled = self.done = False
-        self.cost = np.inf
+        self._fresh = self._settled = self._right = self.done = False
+        self._promised = 0.0
+        self.cost = self.gain = np.inf
 
     def ask(self) -> list[Array]:
         """Return points at which residuals are wanted, none where it is done."""
@@ -70,6 +76,10 @@ class LevenbergMarquardt:
             self._asked = self._around()[1:]
         else:
             self._asked = [self._trial(self._damping * factor) for factor in self._factors]
+            self._promised = self.cost - self._foreseen(self._asked[0])
+            if self._promised <= self._little:
+                self._settle()
+                return self.ask()
         return self._asked
 
     def tell(self, residuals: Sequence[Array]) -> None:
@@ -115,18 +125,24 @@ class LevenbergMarquardt:
         if costs[best] >= self.cost:
             self._failed()
             return
-        gain = self.cost - costs[best]
+        self.gain = self.cost - costs[best]
         moved, change = self._asked[best] - self.vector, residuals[best] - self.residual
         self.vector, self.residual, self.cost = self._asked[best], residuals[best], costs[best]
         self._damping = max(self._damping * self._factors[best] * 0.1, 1e-9)
         self._factors = (1.0,)
+        self._right = abs(self.gain - self._promised) <= _KEPT * self._promised
         self._learn(moved, change)
-        if gain <= 1e-3 + 1e-4 * self.cost:
+        if self.gain <= self._little:
             self._settle()
         else:
             self._settled = False
 
+    @property
+    def _little(self) -> float:
+        return _LITTLE[0] + _LITTLE[1] * self.cost
+
     def _failed(self) -> None:
+        self.gain, self._right = 0.0, False
         if self._settled:
             self.done = True
         elif self._renew and not self._fresh:
@@ -138,7 +154,7 @@ class LevenbergMarquardt:
 
     def _settle(self) -> None:
         """Make sure of the derivatives, once, before it stops."""
-        if self._renew and not self._fresh and not self._settled:
+        if self._renew and not (self._fresh or self._right or self._settled):
             self._stage, self._settled = "renew", True
         else:
             self.done = True
@@ -149,6 +165,11 @@ class LevenbergMarquardt:
             wrong = change.ravel() - self.jacobian @ moved
             self.jacobian = self.jacobian + np.outer(wrong, moved / length)
             self._fresh = False
+
+    def _foreseen(self, vector: Array) -> float:
+        """Return the cost at a point if the derivatives hold."""
+        residual = self.residual.ravel() + self.jacobian @ (vector - self.vector)
+        return self._price(residual, vector)
 
     def _price(self, residual: Array, vector: Array) -> float:
         return float((residual**2).sum() + (vector[: self._size] ** 2).sum())

@@ -30,7 +30,7 @@ _SKIP = 5  # control steps: the longest delay
 _HISTORY = 0.4  # seconds of commands that delay lines and filters look back at
 _ROWS = {"train": 900, "validation": 600, "test": 600}  # control steps simulated per candidate
 _FEWEST = 12  # rows of a run
-_PROBE = 160
+_PROBE = 100  # control steps on which horizons are compared
 _FEW = 8  # segments on which the parameters are fitted first
 _WORTH = 0.2  # nats per effect that a longer horizon must bring
 

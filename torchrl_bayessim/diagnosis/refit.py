@@ -19,6 +19,8 @@ from .levenberg_marquardt import LevenbergMarquardt
 from .objective import Objective, Point, Unit
 
 Array = NDArray[np.float64]
+_BEHIND, _CHANCE = 1.5, 50.0  # times the best cost, and more: no rival of the best
+_CATCHING_UP = 0.2  # of what is missing: what a step of a fit must gain to go on
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,11 @@ class Fit:
     def misfit(self) -> float:
         """``Σ w_i ‖L_i⁻¹ r_i‖²``."""
         return float((self.innovations**2).sum())
+
+    @property
+    def cost(self) -> float:
+        """The misfit and what the prior adds, ``‖z‖²``."""
+        return self.misfit + float((self.point.z**2).sum())
 
     def thinned(self, every: int) -> Fit:
         """Return what the fit is on every so many segments."""
@@ -93,6 +100,7 @@ def refit(
     origins: Sequence[Fit | None] | None = None,
     iterations: int = 8,
     renew: bool = True,
+    race: float | None = None,
 ) -> list[Fit]:
     """Fit parameters, and the strengths that each start has, from each start.
 
@@ -103,6 +111,8 @@ def refit(
         iterations: Steps at most.
         renew: Whether derivatives are made anew where a step fails that they had promised, and
             before a fit stops.
+        race: Stop fits that are far behind the best of them, or behind this cost, and do not
+            catch up; infinite where no cost is known yet.
     """
     models = [tuple(start.strengths) for start in starts]
     descents = [
@@ -130,10 +140,20 @@ def refit(
         for descent, vectors in zip(descents, asked, strict=True):
             if vectors:
                 descent.tell([next(residuals) for _ in vectors])
+        if race is not None:
+            _outrun(descents, min(race, *(descent.cost for descent in descents)))
     return [
         Fit(_point(d.vector, units, objective.size), units, d.residual, d.jacobian)
         for d, units in zip(descents, models, strict=True)
     ]
+
+
+def _outrun(descents: Sequence[LevenbergMarquardt], ahead: float) -> None:
+    """Stop the descents of which steps like the last would not bring them near a cost."""
+    for descent in descents:
+        behind = descent.cost - (_BEHIND * ahead + _CHANCE)
+        if behind > 0 and descent.gain < _CATCHING_UP * behind:
+            descent.done = True
 
 
 def _origin(fit: Fit, units: tuple[Unit, ...]) -> tuple[Array, Array, Array]:

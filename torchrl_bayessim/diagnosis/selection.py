@@ -176,11 +176,16 @@ def _p_value(seen: Screen, model: Model, generator: np.random.Generator) -> floa
 
 
 def _fitted(
-    train: Objective, validation: Objective, base: Model, additions: Sequence[dict[Unit, float]]
+    train: Objective,
+    validation: Objective,
+    base: Model,
+    additions: Sequence[dict[Unit, float]],
+    *,
+    race: float,
 ) -> list[Model]:
-    """Fit the base model with each addition."""
+    """Fit the base model with each addition that can come near a cost."""
     starts = [Point(base.fit.point.z, {**base.fit.point.strengths, **more}) for more in additions]
-    return _judged(train, validation, refit(train, starts)) if starts else []
+    return _judged(train, validation, refit(train, starts, race=race)) if starts else []
 
 
 def _judged(train: Objective, validation: Objective, fits: Sequence[Fit]) -> list[Model]:
@@ -322,7 +327,7 @@ def _alternatives(
         for unit, (_, strength) in strongest.items():
             if len(additions) < most:
                 additions.setdefault(unit.name, {unit: strength})
-        known += _fitted(train, validation, base, list(additions.values()))
+        known += _fitted(train, validation, base, list(additions.values()), race=best.fit.cost)
         result[name] = tuple(known)
     return result
 

@@ -1,0 +1,55 @@
+"""Fits of problems with a known answer; the objective stands for simulator and whitening."""
+
+import numpy as np
+import pytest
+
+from torchrl_bayessim.diagnosis.objective import Point, Unit
+from torchrl_bayessim.diagnosis.refit import refit
+from torchrl_bayessim.effects.action import ActionBias
+from torchrl_bayessim.effects.joints import CoulombFriction
+
+RIGHT = Unit(CoulombFriction(), "hinge", (1.0,), 0.0, 1.0)
+WRONG = Unit(ActionBias(), "motor", (1.0,), -1.0, 1.0)
+
+
+class Bends:
+    """40 innovations that the right unit explains, and the wrong one hardly, along a curve."""
+
+    size, prior = 1, None
+
+    def __init__(self):
+        self.evaluations = {RIGHT: 0, WRONG: 0}
+        self.truth = np.linspace(1.0, 5.0, 40)
+
+    def __call__(self, points):
+        return np.stack([self.one(point) for point in points])
+
+    def one(self, point):
+        (unit, strength), *_ = point.strengths.items()
+        self.evaluations[unit] += 1
+        if unit == RIGHT:
+            left = self.truth * (0.5 - strength)
+        else:
+            left = 0.5 * self.truth + np.cos(np.arange(40)) * np.abs(strength - 0.9) ** 1.5
+        return 20.0 * left.reshape(1, 40)
+
+
+STARTS = [Point(np.zeros(1), {RIGHT: 0.1}), Point(np.zeros(1), {WRONG: 0.1})]
+
+
+def test_a_race_stops_what_is_far_behind_and_leaves_the_best_alone():
+    alone, raced = Bends(), Bends()
+    best, _ = refit(alone, STARTS)
+    first, second = refit(raced, STARTS, race=np.inf)
+    assert first.point.strengths[RIGHT] == pytest.approx(0.5, abs=2e-3)
+    assert first.cost == best.cost
+    assert raced.evaluations[RIGHT] == alone.evaluations[RIGHT]
+    assert raced.evaluations[WRONG] < alone.evaluations[WRONG]
+    assert second.units == (WRONG,)
+
+
+def test_a_known_cost_may_be_what_a_fit_is_behind():
+    alone, raced = Bends(), Bends()
+    refit(alone, STARTS[1:])
+    refit(raced, STARTS[1:], race=0.0)
+    assert raced.evaluations[WRONG] < alone.evaluations[WRONG]
