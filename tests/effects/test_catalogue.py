@@ -143,7 +143,7 @@ def test_effects_without_a_place_on_the_robot_have_no_targets():
 
 def test_only_the_random_and_model_kinds_are_marked_so():
     assert {n for n, kind in CATALOGUE.items() if kind.random} == {
-        "packet_drop", "action_jitter", "action_quantization", "sensor_noise",
+        "packet_drop", "action_jitter", "sensor_noise",
         "sensor_quantization", "sensor_dropout",
     }  # fmt: skip
     assert all(

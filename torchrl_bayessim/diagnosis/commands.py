@@ -18,9 +18,12 @@ Array = NDArray[np.float64]
 
 
 def commanded(
-    robot: Robot, segments: Segments, strengths: Strengths, count: int
+    robot: Robot, segments: Segments, strengths: Strengths, count: int, *, seed: int = 0
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Return the distinct command sequences, ``(B, H, A)``, and which each row follows."""
+    """Return the distinct command sequences, ``(B, H, A)``, and which each row follows.
+
+    Random effects are drawn from ``seed``.
+    """
     size, at = len(segments), segments.history
     upto = at + segments.horizon
     window = torch.from_numpy(segments.ctrl[:, :upto])
@@ -42,7 +45,7 @@ def commanded(
         if on.any():
             strength = torch.from_numpy(values[which][on])[:, None]
             current[torch.from_numpy(on)] = command_sequence(
-                effect, current[torch.from_numpy(on)], strength, robot, time=time
+                effect, current[torch.from_numpy(on)], strength, robot, time=time, seed=seed
             )
     distinct = np.concatenate([plain[None], current[:, :, at:].numpy()])
     return np.ascontiguousarray(distinct.reshape(-1, *plain.shape[1:])), sequence

@@ -7,6 +7,8 @@ __all__ = ["confusion_set", "rivals", "settled", "stand_in"]
 from collections.abc import Mapping
 from dataclasses import replace
 
+from ..effects.effect import Effect
+from ..effects.transmission import ServoDeadBand
 from .objective import Objective
 from .selection import Model, Selection, as_good, parts
 
@@ -20,11 +22,37 @@ def confusion_set(selection: Selection, name: str) -> tuple[str, ...]:
     mean is above zero by more than two standard errors (a model confidence set, Hansen, Lunde &
     Nason 2011) and the likelihood says so too.
 
-    The first name is the effect's own.
+    Beside other effects, what acts like it is compared alone too, without their help: they were
+    found next to it. The first name is the effect's own.
     """
     own = {unit.name for unit in selection.best.units}
     others = [stand_in(selection, rival) for rival in rivals(selection, name)]
+    if len(own) > 1:
+        others += _alike_alone(selection, name)
     return tuple(dict.fromkeys([name, *(other for other in others if other not in own)]))
+
+
+def _alike_alone(selection: Selection, name: str) -> list[str]:
+    """Return what acts like an effect and, alone, explains the data as well as it does alone."""
+    alone = [m for m in selection.tried if len({u.name for u in m.units}) == 1]
+    mine = [m for m in alone if m.units[0].name == name]
+    if not mine:
+        return []
+    best = min(mine, key=lambda m: float(m.deviances().sum()))
+    effect = best.units[0].effect
+    return [
+        m.units[0].name for m in alone if _alike(effect, m.units[0].effect) and as_good(best, m)
+    ]
+
+
+def _alike(one: Effect, other: Effect) -> bool:
+    """Return whether two effects act alike: of one group, or a servo's dead band and friction.
+
+    A servo that ignores small errors stands still, as if there were stiction.
+    """
+    groups = {one.group, other.group}
+    servo = isinstance(one, ServoDeadBand) or isinstance(other, ServoDeadBand)
+    return len(groups) == 1 or (servo and "friction" in groups)
 
 
 def rivals(selection: Selection, name: str) -> list[Model]:

@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from ..effects.catalogue import CATALOGUE, effect
 from ..effects.effect import Effect
+from ..effects.sensors import SensorDropout
 from ..envs.task import Task
 from ..envs.tasks.catalogue import known_task
 from ..errors import message
@@ -20,12 +21,15 @@ from ..logs.log import Log
 from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
 from ..physics.mujoco import MujocoPhysics
+from .chance import chances, detectable, of_chance
 from .evidence import assemble
+from .holds import bridged
 from .objective import Unit, pushes_of, units_of
 from .preparation import Prepared, prepare
 from .report import Report
+from .scatter import Scatter, gap_with_holds
 from .selection import select
-from .shapes import shaped
+from .shapes import SHAPED, shaped
 
 _ALPHA = 0.01
 
@@ -61,12 +65,14 @@ def diagnose(
     begun = time.perf_counter()
     system = _system(simulator, prior)
     chosen = _effects(system, effects)
-    units = [u for u in units_of(chosen, system.robot) if not u.effect.random]
+    every = units_of(chosen, system.robot)
+    units = [unit for unit in every if not unit.effect.random]
     generator = np.random.default_rng(seed)
     # many small matrices: threads of their own cost more than they bring
     with threadpool_limits(1, user_api="blas"):
         progress("fitting the parameters")
-        prepared = prepare(system, logs, units, generator=generator, horizon=horizon)
+        bridges, holds = bridged(logs, system.robot) if _asks_for_holds(every) else (logs, [])
+        prepared = prepare(system, bridges, units, generator=generator, horizon=horizon)
         units = _with_shapes(system, prepared, units)
         selection = select(
             prepared.sets["train"],
@@ -77,11 +83,21 @@ def diagnose(
             generator=generator,
             progress=progress,
         )
+        random = of_chance(every)
+        progress("looking for scatter")
+        found = chances(prepared.sets, selection, random)
+        least = detectable(prepared.sets["train"], selection, random)
         progress("opening the test runs")
         return assemble(
             system,
             prepared=prepared,
             selection=selection,
+            scatter=Scatter(
+                found,
+                least,
+                holds,
+                gap_with_holds(prepared, logs, selection) if holds else 1.0,
+            ),
             findings=findings,
             generator=generator,
             begun=begun,
@@ -89,9 +105,13 @@ def diagnose(
         )
 
 
+def _asks_for_holds(units: Sequence[Unit]) -> bool:
+    return any(unit.name == SensorDropout.name for unit in units)
+
+
 def _with_shapes(system: System, prepared: Prepared, units: list[Unit]) -> list[Unit]:
-    """Return the units, with frequencies and phases that the data suggest."""
-    names = {unit.name for unit in units} & {"periodic_disturbance", "cogging"}
+    """Return the units, with frequencies, phases and steps that the data suggest."""
+    names = {unit.name for unit in units} & set(SHAPED)
     if not names:
         return units
     found = shaped(

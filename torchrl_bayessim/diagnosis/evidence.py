@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..effects.effect import Effect
 from ..effects.robot import Robot
+from ..effects.sensors import SensorDropout
 from ..effects.units import unit_at
 from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
@@ -26,6 +27,7 @@ from .preparation import Prepared
 from .refit import Fit
 from .report import Candidate, Finding, Gap, Parameter, Report
 from .rollout import rollout_errors
+from .scatter import Scatter
 from .screening import Screen
 from .selection import Model, Selection
 from .shrinkage import Shrinkage, shares, shrinkage
@@ -39,6 +41,7 @@ def assemble(
     *,
     prepared: Prepared,
     selection: Selection,
+    scatter: Scatter,
     findings: Sequence[SanityFinding],
     generator: np.random.Generator,
     begun: float,
@@ -50,6 +53,7 @@ def assemble(
         system: The robot.
         prepared: Split, noise, horizon, nominal fit.
         selection: What the search found.
+        scatter: What was found of effects of chance.
         findings: Of the sanity gate.
         generator: Of the bootstrap.
         begun: When the diagnosis began, by ``time.perf_counter``.
@@ -74,8 +78,19 @@ def assemble(
     rollouts = rollout_errors(
         prepared, {"raw": zero, "refit": nominal.fit.point, "with_effects": best.fit.point}
     )
-    candidates = _candidates(selection, confused, alpha)
     effects = _effects(selection, credit, measured, system.robot)
+    strengths = _by_target(best.fit.point, system.robot)
+    if scatter.found:
+        measured, confused = scatter.measured(measured, generator), scatter.names
+        effects = scatter.findings(measured, system.robot)
+        strengths = scatter.strengths(system.robot)
+    if scatter.holds:
+        measured = scatter.with_holds(measured)
+        others = sum(effect.share_of_gap for effect in effects)
+        held = scatter.held_findings(measured, others)
+        effects, confused = (*effects, *held), confused or tuple(f.name for f in held)
+        strengths |= {SensorDropout(): dict(held[0].strengths)}
+    candidates = (*_candidates(selection, confused, alpha), *scatter.candidates())
     gap = Gap(
         horizon_steps=prepared.horizon,
         raw=measured.raw,
@@ -100,6 +115,7 @@ def assemble(
         effects=effects,
         candidates=candidates,
         confused=confused,
+        scattered=scatter.groups,
         where=where,
         alpha=alpha,
     )
@@ -128,7 +144,7 @@ def assemble(
             "p_values": list(selection.p_values),
             "seconds": time.perf_counter() - begun,
         },
-        strengths=_by_target(best.fit.point, system.robot) if effects else {},
+        strengths=strengths if effects else {},
         figures=figures(prepared, selection, measured),
     )
 

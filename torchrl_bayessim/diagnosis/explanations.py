@@ -90,7 +90,7 @@ def explanations(train: Objective, now: Round) -> list[Fit]:
     if not starts:
         return []
     tried = refit(now.thin, starts, origins=origins, iterations=0, renew=False)
-    tried = sorted(tried, key=_promise)[:_PROMISING]
+    tried = _promising(tried) if bent(base) else sorted(tried, key=_promise)[:_PROMISING]
     starts = [fit.point for fit in tried]
     tried = refit(now.thin, starts, origins=tried, iterations=3, renew=False)
     everywhere = [
@@ -173,6 +173,19 @@ def bent(fit: Fit) -> bool:
 def _plain(fit: Fit) -> bool:
     """Return whether so much is left that the segments of the fit say enough."""
     return bool(fit.misfit - fit.innovations.size > _PLAIN)
+
+
+def _promising(tried: Sequence[Fit]) -> list[Fit]:
+    """Return each effect's most promising fit, and the most promising of all.
+
+    Far from the truth one step promises little, to the right effect too.
+    """
+    order = sorted(tried, key=_promise)
+    first: dict[frozenset[str], Fit] = {}
+    for fit in order:
+        if len(_names(fit)) == min(len(_names(other)) for other in order):
+            first.setdefault(_names(fit), fit)
+    return [*first.values(), *(f for f in order[:_PROMISING] if f not in first.values())]
 
 
 def _promise(fit: Fit) -> float:

@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 _STEP = 0.01  # of a prior standard deviation, and of an effect's range
 _CAREFUL = (3.0, 100.0)  # dampings tried after a step that failed, times the one before
+_FULL = 1e-3  # damping of a step that is hardly damped
+_RANGE = (_FULL, 0.1, 1.0, 10.0)  # dampings of steps that may promise something
 _STUCK = 1e4  # damping beyond which there is nothing to gain
 _LITTLE = 1e-3, 1e-4  # gains that end a descent: absolute, and of the cost
 _KEPT = 0.25  # of a promise: by how much a gain may differ from it where derivatives are right
@@ -58,12 +60,11 @@ class LevenbergMarquardt:
         self._low, self._high = bounds
         self.vector = np.clip(vector, *bounds)
         self._size, self._renew = size, renew
-        self._damping, self._factors = 1e-3, (1.0,)
+        self._damping, self._factors = _FULL, (1.0,)
         self._asked: list[Array] = []
         self._origin = origin
         self._stage = "begin"
         self._fresh = self._settled = self._right = self.done = False
-        self._promised = 0.0
         self.cost = self.gain = np.inf
 
     def ask(self) -> list[Array]:
@@ -75,11 +76,10 @@ class LevenbergMarquardt:
         elif self._stage == "renew":
             self._asked = self._around()[1:]
         else:
-            self._asked = [self._trial(self._damping * factor) for factor in self._factors]
-            self._promised = self.cost - self._foreseen(self._asked[0])
-            if self._promised <= self._little:
-                self._settle()
+            if (self._fresh or self._right) and self._at_end():
+                self.done = True
                 return self.ask()
+            self._asked = [self._trial(self._damping * factor) for factor in self._factors]
         return self._asked
 
     def tell(self, residuals: Sequence[Array]) -> None:
@@ -122,6 +122,7 @@ class LevenbergMarquardt:
     def _tried(self, residuals: Sequence[Array]) -> None:
         costs = [self._price(r, v) for r, v in zip(residuals, self._asked, strict=True)]
         best = int(np.argmin(costs))
+        promised = [self._promise(vector) for vector in self._asked]
         if costs[best] >= self.cost:
             self._failed()
             return
@@ -130,7 +131,7 @@ class LevenbergMarquardt:
         self.vector, self.residual, self.cost = self._asked[best], residuals[best], costs[best]
         self._damping = max(self._damping * self._factors[best] * 0.1, 1e-9)
         self._factors = (1.0,)
-        self._right = abs(self.gain - self._promised) <= _KEPT * self._promised
+        self._right = abs(self.gain - promised[best]) <= _KEPT * promised[best]
         self._learn(moved, change)
         if self.gain <= self._little:
             self._settle()
@@ -166,10 +167,18 @@ class LevenbergMarquardt:
             self.jacobian = self.jacobian + np.outer(wrong, moved / length)
             self._fresh = False
 
-    def _foreseen(self, vector: Array) -> float:
-        """Return the cost at a point if the derivatives hold."""
+    def _at_end(self) -> bool:
+        """Return whether no step promises anything.
+
+        A damped one promises little anywhere; a full one may be cut off at a bound.
+        """
+        steps = [self._trial(damping) for damping in _RANGE]
+        return max(self._promise(step) for step in steps) <= self._little
+
+    def _promise(self, vector: Array) -> float:
+        """Return what a point would gain if the derivatives held."""
         residual = self.residual.ravel() + self.jacobian @ (vector - self.vector)
-        return self._price(residual, vector)
+        return self.cost - self._price(residual, vector)
 
     def _price(self, residual: Array, vector: Array) -> float:
         return float((residual**2).sum() + (vector[: self._size] ** 2).sum())

@@ -73,6 +73,7 @@ class Predictor:
         steps: Time steps simulated so far.
         exact: Whether forces follow the state at every time step, as in an environment, and not
             only every 10 ms, which is enough to tell effects apart.
+        realisation: Seed of random effects.
     """
 
     def __init__(self, system: System, *, threads: int | None = None) -> None:
@@ -81,6 +82,7 @@ class Predictor:
         self.sensing = Sensing(system, self.tangent)
         self.steps = 0
         self.exact = False
+        self.realisation = 0
         task = system.task
         self._models = ModelBatch(task.model, 1)
         # from the beginning, since what one table overrides stays in a thread's model after it
@@ -153,7 +155,7 @@ class Predictor:
     ) -> Array:
         restored = self.sensing.restored(segments, strengths, len(theta))
         simulated = self._simulate(segments, theta, strengths, restored=restored, offsets=offsets)
-        return self.sensing.compare(segments, simulated, restored, strengths)
+        return self.sensing.compare(segments, simulated, restored, strengths, seed=self.realisation)
 
     def _simulate(
         self,
@@ -166,7 +168,9 @@ class Predictor:
     ) -> Array:
         """Return what follows from the start states, shape ``(P, S, H, outputs)``."""
         count, size, horizon = len(theta), len(segments), segments.horizon
-        commands, sequence = commanded(self.system.robot, segments, strengths, count)
+        commands, sequence = commanded(
+            self.system.robot, segments, strengths, count, seed=self.realisation
+        )
         self._write(theta, strengths)
         stepper, at = self._stepper, segments.history
         if stepper.num_envs != count * size:

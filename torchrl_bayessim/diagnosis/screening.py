@@ -16,7 +16,7 @@ could in a pair, on all.
 
 from __future__ import annotations
 
-__all__ = ["Screen", "screen"]
+__all__ = ["Screen", "crossing", "screen"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -101,7 +101,7 @@ class Screen:
         for unit in dict.fromkeys(self.units):
             rows = [i for i, u in enumerate(self.units) if u == unit and self.strengths[i] > 0]
             rows.sort(key=lambda i: self.strengths[i])
-            result[unit] = _crossing(self.strengths[rows], norms[rows], threshold)
+            result[unit] = crossing(self.strengths[rows], norms[rows], threshold)
         return result
 
     def origin(self, fit: Fit, added: Sequence[Unit]) -> Fit | None:
@@ -229,7 +229,7 @@ def _basis(fit: Fit, size: int) -> Array:
     return left[:, values > 1e-9 * max(values.max(), 1e-30)]
 
 
-def _crossing(strengths: Array, norms: Array, threshold: float) -> float:
+def crossing(strengths: Array, norms: Array, threshold: float) -> float:
     """Return where ``norms`` reach ``threshold``, between two levels by a power law."""
     above = np.flatnonzero(norms >= threshold)
     if not len(above):

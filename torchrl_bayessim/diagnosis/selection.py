@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from ..effects.effect import ForceEffect
 from .explanations import bent, compare, explanations
@@ -25,7 +26,8 @@ from .screening import Screen
 
 Array = NDArray[np.float64]
 _LIKELY = 6.0  # a deviance that chance often makes
-_DEVIATIONS = 2.3  # of a normal distribution: one in a hundred
+_CHANCE = 0.01  # of a test that two models explain the data equally well
+_WORSE = 1.5  # times the misfit of the best model: too much for an equal, however few the data
 _SHARE = 0.1  # of the gap: what an effect that could be another must remove to be kept
 _REST = 0.5  # of what the base leaves: what any further effect must remove
 _REMAINS = 0.01  # of the gap: not worth another effect
@@ -349,17 +351,23 @@ def as_good(best: Model, rival: Model) -> bool:
         return True
     if float(mine.sum()) / (best.fit.innovations.size + best.validation.size) < _WHITE:
         return False
+    if float(others.sum()) > _WORSE * float(mine.sum()):
+        return False
     kinds = others - mine, np.log(others / mine)
-    return max(_score(kind, best.logs) for kind in kinds) < _DEVIATIONS
+    return all(_positive(kind, best.logs) > _CHANCE for kind in kinds)
 
 
-def _score(differences: Array, logs: NDArray[np.int64]) -> float:
-    """Return the mean in standard errors, of segments or of logs, whichever are larger.
+def _positive(differences: Array, logs: NDArray[np.int64]) -> float:
+    """Return the p-value of a positive mean, with errors of segments or of logs.
 
     What is wrong with both models is wrong all along a log, and speaks for the one in some logs and
-    for the other in others (clustered errors, Liang & Zeger 1986).
+    for the other in others: so the larger error counts, and if it is that of ``G`` logs, Student's
+    distribution with ``G - 1`` degrees of freedom (clustered errors, Liang & Zeger 1986; Cameron &
+    Miller 2015).
     """
     mean, count = float(differences.mean()), len(differences)
     by_log = np.bincount(logs, differences - mean)
-    errors = float(((differences - mean) ** 2).sum()), float((by_log**2).sum())
-    return mean / max(np.sqrt(max(errors)) / count, 1e-12)
+    alone, together = float(((differences - mean) ** 2).sum()), float((by_log**2).sum())
+    score = mean / max(np.sqrt(max(alone, together)) / count, 1e-12)
+    groups = len(np.unique(logs)) if together > alone else count
+    return float(student.sf(score, max(groups - 1, 1)))

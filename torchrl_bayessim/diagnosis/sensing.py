@@ -54,6 +54,27 @@ class Sensing:
                 true[on] = restored_sequence(effect, true[on], strength, robot, time=time)
         return (true - measured).numpy()
 
+    def scattered(self, segments: Segments, strengths: Strengths, *, seed: int) -> Array | None:
+        """Return true start states minus measured ones, drawn, ``(P, S, 2 nv)``, or nothing.
+
+        What a random effect would have made of the record, had it been true, with the other sign.
+        """
+        kinds = [e for e in strengths if isinstance(e, SensorEffect) and e.random]
+        if not kinds:
+            return None
+        at = segments.history
+        measured = torch.from_numpy(self.values(segments.qpos, segments.qvel)[:, : at + 1])
+        time = torch.from_numpy(segments.time[:, : at + 1])
+        count = len(strengths[kinds[0]])
+        steps = np.zeros((count, len(segments), 2 * self._tangent.size))
+        for effect in kinds:
+            strength = torch.from_numpy(strengths[effect])[:, None]
+            robot = self._system.robot
+            record = measured.expand(count, *measured.shape)
+            seen = measured_sequence(effect, record, strength, robot, time=time, seed=seed)
+            steps[..., self.channels] += (measured - seen)[:, :, at].numpy()
+        return steps
+
     def values(self, qpos: Array, qvel: Array) -> Array:
         """Return what the channels of hinges and slides hold, zero for the others."""
         values = np.zeros((*qpos.shape[:-1], len(self.channels)))
@@ -68,9 +89,15 @@ class Sensing:
         return values
 
     def compare(
-        self, segments: Segments, simulated: Array, restored: Array | None, strengths: Strengths
+        self,
+        segments: Segments,
+        simulated: Array,
+        restored: Array | None,
+        strengths: Strengths,
+        *,
+        seed: int = 0,
     ) -> Array:
-        """Return measured minus simulated, ``(P, S, K, C)``."""
+        """Return measured minus simulated, ``(P, S, K, C)``; random effects from ``seed``."""
         nq = self._system.task.model.nq
         rows, checked = segments.rows, segments.checked - 1
         qpos, qvel = simulated[..., :nq], simulated[..., nq : nq + self._tangent.size]
@@ -84,7 +111,7 @@ class Sensing:
         true = self.values(qpos, qvel)
         before = self.values(segments.qpos, segments.qvel)[:, : segments.history + 1]
         history = before + restored[:, :, : segments.history + 1]
-        wrong = self._seen(segments, history, true, kinds) - true
+        wrong = self._seen(segments, history, true, kinds, seed=seed) - true
         return residual - wrong[:, :, checked]
 
     def _seen(
@@ -93,6 +120,8 @@ class Sensing:
         history: Array,
         true: Array,
         kinds: Sequence[tuple[SensorEffect, Array]],
+        *,
+        seed: int,
     ) -> Array:
         """Return what sensors show of simulated values, given the true ones before the start."""
         record = torch.from_numpy(np.concatenate([history, true], axis=2))
@@ -102,5 +131,7 @@ class Sensing:
             on = torch.from_numpy(values.any(1))
             if on.any():
                 strength = torch.from_numpy(values)[on][:, None]
-                record[on] = measured_sequence(effect, record[on], strength, robot, time=time)
+                record[on] = measured_sequence(
+                    effect, record[on], strength, robot, time=time, seed=seed
+                )
         return record[:, :, segments.history + 1 :].numpy()

@@ -1,42 +1,49 @@
-"""Frequency and phase of periodic forces, read off the force that is missing.
+"""Frequency and phase of periodic forces, and the step of commands, read off the missing force.
 
 A periodic disturbance ``s sin(2πft + φ)`` and cogging ``s sin(kq + φ)`` each have two numbers
 beside their strength, which no screen at fixed values can find. Over a few steps a missing force is
 nearly constant, so its course is estimated first, one value per short segment and joint, and the
-best sine over time and over position is fitted to it.
+best sine over time and over position is fitted to it. So is what rounding the recorded commands
+would have taken away or added, since signatures of two steps that differ a little have nothing in
+common.
 """
 
 from __future__ import annotations
 
-__all__ = ["shaped"]
+__all__ = ["SHAPED", "shaped"]
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..effects.action import ActionQuantization
 from ..effects.disturbance import Cogging, PeriodicDisturbance
 from ..effects.effect import Effect
 from ..logs.log import Log
 from .location import missing_force
 from .objective import Objective, Point, Unit, parameters_at, units_of
 from .prediction import Predictor
+from .screening import LEVELS
 from .segments import cut
 from .whitening import whitening
 
 Array = NDArray[np.float64]
+SHAPED = (PeriodicDisturbance.name, Cogging.name, ActionQuantization.name)
 _STEPS = 6  # control steps over which a force is taken to be constant
 _MOST = 400  # segments
 _SLOWEST = 0.5  # cycles per log: slower ones are trends
 _NUMBERS = np.arange(2, 25)  # cogs per turn; one is gravity's
-_CLEAR = 0.1  # share of the force's variance that a sine must explain
+_CLEAR = 0.1  # share of the force's variance that a sine or a step must explain
+_FINEST, _GRID = 0.02, 600  # of the largest step that is plausible; steps tried
 
 
 def shaped(
     predictor: Predictor, logs: Sequence[Log], *, z: Array, noise: Array, pushes: Sequence[Unit]
 ) -> list[Unit]:
-    """Return a periodic disturbance and cogging at each joint where a sine stands out.
+    """Return periodic disturbances, cogging, and rounded commands, where they stand out.
 
     Args:
         predictor: Simulates.
@@ -68,15 +75,35 @@ def shaped(
         if best is not None:
             found.append(Cogging(number=round(best[0]), phase=best[1]))
         units += [u for u in units_of(found, system.robot) if u.where == push.where]
+    for unit in units_of([ActionQuantization()], system.robot):
+        joint, actuator = unit.joint(system.robot), unit.direction.index(1.0)
+        column = next((i for i, p in enumerate(pushes) if p.joint(system.robot) == joint), None)
+        if joint < 0 or column is None or unit.where == "all":
+            continue
+        window = slice(pieces.history, pieces.history + _STEPS)
+        step = _rounding(force[:, column], pieces.ctrl[:, window, actuator], unit.high)
+        if step is not None:  # the screen's higher level is the step itself
+            units.append(replace(unit, high=step / LEVELS[-1]))
     return units
+
+
+def _rounding(force: Array, commands: Array, most: float) -> float | None:
+    """Return the step to which commands ``(S, T)`` seem to be rounded, if one stands out."""
+    target = _bounded(force)
+    best, choice = _CLEAR * float(target @ target), None
+    for step in most * np.geomspace(_FINEST, 1.0, _GRID):
+        error = (np.round(commands / step) * step - commands).mean(1)
+        error = error - error.mean()
+        along = float(error @ target)
+        if along > 0 and along**2 > best * float(error @ error):
+            best, choice = along**2 / float(error @ error), float(step)
+    return choice
 
 
 def _sine(force: Array, angle: Array, rates: Array) -> tuple[float, float] | None:
     """Return rate and phase of the sine of the angle that explains most, if it stands out."""
-    # large forces are outliers of short segments: a median's distance bounds what they weigh
-    bound = 4.0 * np.median(np.abs(force - np.median(force))) + 1e-12
-    target = np.clip(force - np.median(force), -bound, bound)
-    total = float(((target - target.mean()) ** 2).sum())
+    target = _bounded(force)
+    total = float((target**2).sum())
     best, choice = _CLEAR * total, None
     for rate in rates:
         columns = np.stack([np.sin(rate * angle), np.cos(rate * angle), np.ones_like(angle)], 1)
@@ -86,3 +113,10 @@ def _sine(force: Array, angle: Array, rates: Array) -> tuple[float, float] | Non
             best = explained
             choice = float(rate), math.atan2(solution[1], solution[0])
     return choice
+
+
+def _bounded(force: Array) -> Array:
+    """Return the force without its mean and without what short segments make of single rows."""
+    bound = 4.0 * np.median(np.abs(force - np.median(force))) + 1e-12
+    bounded = np.clip(force - np.median(force), -bound, bound)
+    return bounded - bounded.mean()

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 __all__ = ["conclude"]
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,7 @@ def conclude(
     effects: Sequence[Finding],
     candidates: Sequence[Candidate],
     confused: Sequence[str],
+    scattered: Set[str],
     where: Mapping[str, Any],
     alpha: float,
 ) -> tuple[Verdict, str, list[str]]:
@@ -47,6 +48,7 @@ def conclude(
     alarms: list[str] = []
     groups = {u.effect.group for u in selection.best.units if u.name in confused[:1]}
     groups |= {u.effect.group for s in selection.screens[:1] for u in s.units if u.name in confused}
+    groups |= scattered
     significant = selection.p_values[0] <= alpha
     splits = [float((m**2).mean()) for m in
               (selection.nominal.fit.innovations, selection.nominal.validation)]  # fmt: skip

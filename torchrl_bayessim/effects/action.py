@@ -238,8 +238,7 @@ class PacketDrop(ActionEffect):
 class ActionQuantization(ActionEffect):
     """Commands are rounded to multiples of ``s``; in their units, 0 to 20 % of ``u_max``."""
 
-    name, unit, group = "action_quantization", "command", "noise"
-    memoryless, random = True, True
+    name, unit, group, memoryless = "action_quantization", "command", "noise", True
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.2 ``u_max``."""

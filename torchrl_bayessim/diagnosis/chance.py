@@ -1,0 +1,278 @@
+"""Effects of chance, such as lost packets: seen by the scatter that they leave, not by their mean.
+
+What a random effect did in a run is not recorded, so no single simulation imitates it. Of ``R``
+simulations with draws of their own, the innovations have mean ``μ_i`` and covariance ``Σ_i`` in
+segment ``i``, and those of the robot are likely as (a synthetic likelihood, Wood 2010)::
+
+    r_i + J_i δ ~ N(-μ_i, φ I + Σ_i),    δ ~ N(0, I) the parameters' change from the nominal fit.
+
+On average a lost packet is a lag: ``E u_k = (1 - s) u_k + s E u_{k-1}``; a lag itself leaves noise
+alone. So the likelihood is compared with that of the best explanation without chance, whose
+scatter ``φ`` is free, which excuses any error that is spread evenly. What a catalogue does not know
+leaves errors too, so an effect of chance must leave noise alone by its own standard.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Chance", "chances", "detectable", "of_chance"]
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..effects.effect import SensorEffect
+from .objective import Objective, Point, Unit, strengths_of
+from .refit import refit
+from .screening import crossing
+from .selection import Selection
+
+Array = NDArray[np.float64]
+_DRAWS, _FEW = 12, 4  # simulations of each candidate, and of what is only to be ruled out
+_LEVELS = (0.08, 0.2, 0.45, 1.0)  # of an effect's range
+_AROUND = (0.65, 0.8, 1.25, 1.55)  # times the best of these
+_SCATTER = np.geomspace(0.6, 4.0, 20)  # φ
+_WHITE = 1.15  # mean squared innovation of a model that leaves nothing to chance
+_CALM = 1.3  # φ beyond which an effect of chance has not explained the scatter
+_SEGMENTS = 8  # of each split
+_APART = 4  # targets of one effect that are looked at singly
+_NEEDED, _LIKELY = 20.0, 6.0  # deviances: to be found, and that chance often makes
+
+
+@dataclass(frozen=True, eq=False)
+class Chance:
+    """A random effect that explains the scatter.
+
+    Attributes:
+        unit: The effect and where.
+        strength: Its most likely strength.
+        error: Standard deviation of that.
+        gain: Deviance gained over the best explanation without chance.
+        left: Mean squares of its standardised innovations in test segments, shape ``(S,)``.
+    """
+
+    unit: Unit
+    strength: float
+    error: float
+    gain: float
+    left: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Data:
+    """Some segments: innovations of the nominal fit, ``(S, M)``, and derivatives."""
+
+    objective: Objective
+    left: Array
+    derivatives: Array
+
+    @classmethod
+    def of(cls, objective: Objective, point: Point) -> _Data:
+        """Return the data of a split, on some segments."""
+        every = max(1, len(objective.segments) // _SEGMENTS)
+        some = objective.thinned(every)
+        fit = refit(some, [Point(point.z)], iterations=0)[0]
+        weights = some.whitening.weights[:, None]
+        derivatives = fit.jacobian.reshape(*fit.innovations.shape, -1) / weights[..., None]
+        return cls(some, fit.innovations / weights, derivatives)
+
+    def draws(self, points: Sequence[Point], count: int = _DRAWS) -> Array:
+        """Return what chance changes, shape ``(P, R, S, M)``."""
+        predictor = self.objective.predictor
+        found = []
+        try:
+            for draw in range(count):
+                predictor.realisation = 1 + draw
+                found.append(self._changed(points))
+        finally:
+            predictor.realisation = 0
+        return np.stack(found, 1)
+
+    def _changed(self, points: Sequence[Point]) -> Array:
+        predictor, segments = self.objective.predictor, self.objective.segments
+        theta = self.objective.theta(np.stack([point.z for point in points]))
+        strengths = strengths_of(points, predictor.system.robot)
+        offsets = predictor.sensing.scattered(segments, strengths, seed=predictor.realisation)
+        residual = predictor.residuals(segments, theta, strengths, offsets)
+        weights = self.objective.whitening.weights[:, None]
+        drift = self.objective.whitening.drift
+        share = np.array([point.z[-1] for point in points])
+        innovations = self.objective.whitening(residual) / weights
+        return innovations - share[:, None, None] * drift - self.left
+
+
+def of_chance(units: Sequence[Unit]) -> list[Unit]:
+    """Return the units whose draws matter: not those that are noise of a sensor, and no more.
+
+    The noise floor is estimated from the data, and has the latter. Where one effect has many
+    targets, it is looked for at all of them together.
+    """
+    random = [u for u in units if u.effect.random]
+    random = [u for u in random if not (u.effect.memoryless and isinstance(u.effect, SensorEffect))]
+    counts = Counter(unit.name for unit in random)
+    return [u for u in random if u.where == "all" or counts[u.name] <= _APART]
+
+
+def detectable(train: Objective, selection: Selection, units: Sequence[Unit]) -> dict[Unit, float]:
+    """Return the least strength of each unit whose scatter would be seen, infinite if none is.
+
+    The mean squared innovation that it adds must reach what calls for an effect of chance.
+    """
+    data, z = _Data.of(train, selection.nominal.fit.point), selection.nominal.fit.point.z
+    result = {}
+    for unit in units:
+        levels = np.array(_LEVELS) * unit.high
+        points = [Point(z, {unit: float(level)}) for level in levels]
+        added = (data.draws(points, _FEW) ** 2).mean((1, 2, 3))
+        result[unit] = crossing(levels, added, _WHITE - 1.0)
+    return result
+
+
+def chances(
+    sets: Mapping[str, Objective], selection: Selection, units: Sequence[Unit]
+) -> list[Chance]:
+    """Return the random effects that explain what the best model leaves, the likeliest first.
+
+    Looked for where it leaves more than noise, or is itself an effect of timing.
+
+    Args:
+        sets: Training, validation and test segments.
+        selection: What the search without chance found.
+        units: Random effects at their targets.
+    """
+    if not units or _calm(selection):
+        return []
+    point = selection.nominal.fit.point
+    judged = [_Data.of(sets[name], point) for name in ("train", "validation")]
+    rows = [(unit, level * unit.high) for unit in units for level in _LEVELS]
+    base = _without(judged, selection.best.fit.point)
+    costs = _costs(judged, rows, point)
+    best: dict[Unit, tuple[float, float]] = {}
+    for (unit, strength), cost in zip(rows, costs, strict=True):
+        best[unit] = min(best.get(unit, (np.inf, 0.0)), (cost, strength))
+    least = min(cost for cost, _ in best.values())
+    if base - least < _NEEDED:
+        return []
+    found = [
+        _refined(judged, sets["test"], unit, strength, point=point, base=base)
+        for unit, (cost, strength) in best.items()
+        if cost < least + 4 * _LIKELY
+    ]
+    found = [chance for chance in found if chance is not None]
+    most = max((chance.gain for chance in found), default=0.0)
+    found = [c for c in found if c.gain > max(_NEEDED, most - _LIKELY)]
+    return sorted(found, key=lambda c: -c.gain)
+
+
+def _calm(selection: Selection) -> bool:
+    best = selection.best
+    if any(unit.effect.group == "timing" for unit in best.units):
+        return False  # what varies is late on average
+    return max(float((best.fit.innovations**2).mean()), best.dispersion()) < _WHITE
+
+
+def _without(judged: Sequence[_Data], point: Point) -> float:
+    """Return the deviance of an explanation without chance, of evenly spread scatter."""
+    left = [d.objective([point])[0] / d.objective.whitening.weights[:, None] for d in judged]
+    squares, count = sum(float((r**2).sum()) for r in left), sum(r.size for r in left)
+    return min(squares / phi + count * np.log(phi) for phi in _SCATTER)
+
+
+def _costs(
+    judged: Sequence[_Data], rows: Sequence[tuple[Unit, float]], point: Point
+) -> list[float]:
+    points = [Point(point.z, {unit: strength}) for unit, strength in rows]
+    drawn = [data.draws(points) for data in judged]
+    costs = []
+    for p in range(len(rows)):
+        change = _change(judged[0], drawn[0][p])
+        costs.append(
+            sum(_deviance(data, d[p], change)[0] for data, d in zip(judged, drawn, strict=True))
+        )
+    return costs
+
+
+def _change(data: _Data, drawn: Array) -> Array:
+    """Return ``δ``, how the parameters move beside an effect of chance, by draws ``(R, S, M)``."""
+    values, vectors = _spectrum(drawn)
+    error = data.left + drawn.mean(0)
+
+    def weighed(columns: Array) -> Array:
+        inside = np.einsum("srm,smd->srd", vectors, columns)
+        shrunk = (1 - 1 / np.sqrt(1 + values))[..., None] * inside
+        return columns - np.einsum("srm,srd->smd", vectors, shrunk)
+
+    derivatives = weighed(data.derivatives).reshape(-1, data.derivatives.shape[-1])
+    target = weighed(error[..., None]).reshape(-1)
+    normal = derivatives.T @ derivatives + np.eye(derivatives.shape[1])
+    change = -np.linalg.solve(normal, derivatives.T @ target)
+    return np.asarray(change, dtype=np.float64)
+
+
+def _spectrum(drawn: Array) -> tuple[Array, Array]:
+    """Return eigenvalues ``(S, R)`` and eigenvectors ``(S, R, M)`` of what chance scatters."""
+    centred = (drawn - drawn.mean(0)).transpose(1, 0, 2) / np.sqrt(len(drawn) - 1)
+    _, roots, vectors = np.linalg.svd(centred, full_matrices=False)
+    return roots**2, vectors
+
+
+def _deviance(data: _Data, drawn: Array, change: Array) -> tuple[float, float, Any]:
+    """Return the least deviance over ``φ``, that ``φ``, and mean squares for ``φ = 1``, (S,)."""
+    values, vectors = _spectrum(drawn)
+    error = data.left + drawn.mean(0) + data.derivatives @ change
+    inside = np.einsum("srm,sm->sr", vectors, error) ** 2
+    beside = np.maximum((error**2).sum(-1) - inside.sum(-1), 0.0)
+    free = error.shape[1] - values.shape[1]
+    costs = [
+        float((inside / (phi + values) + np.log(phi + values)).sum())
+        + float((beside / phi + free * np.log(phi)).sum())
+        for phi in _SCATTER
+    ]
+    standard = ((inside / (1 + values)).sum(-1) + beside) / error.shape[1]
+    best = int(np.argmin(costs))
+    return costs[best], float(_SCATTER[best]), standard.astype(np.float64)
+
+
+def _refined(
+    judged: Sequence[_Data],
+    test: Objective,
+    unit: Unit,
+    strength: float,
+    *,
+    point: Point,
+    base: float,
+) -> Chance | None:
+    """Return the effect at its likeliest strength, nothing if it leaves more than noise."""
+    strengths = np.array([1.0, *_AROUND]) * strength
+    strengths = np.unique(np.minimum(strengths, unit.high))
+    points = [Point(point.z, {unit: float(s)}) for s in strengths]
+    drawn = [data.draws(points) for data in judged]
+    changes = [_change(judged[0], d) for d in drawn[0]]
+    told = [
+        [_deviance(data, d[p], change) for data, d in zip(judged, drawn, strict=True)]
+        for p, change in enumerate(changes)
+    ]
+    costs = np.array([sum(cost for cost, _, _ in one) for one in told])
+    best = int(np.argmin(costs))
+    if max(phi for _, phi, _ in told[best]) > _CALM:
+        return None
+    unseen = _Data.of(test, point)
+    after = _deviance(unseen, unseen.draws([points[best]])[0], changes[best])[2]
+    return Chance(
+        unit=unit,
+        strength=float(strengths[best]),
+        error=_error(np.log(strengths), costs) * float(strengths[best]),
+        gain=base - float(costs[best]),
+        left=after,
+    )
+
+
+def _error(logs: Array, costs: Array) -> float:
+    """Return the relative standard deviation of a strength, by a parabola through the costs."""
+    if len(logs) < 3:
+        return 0.5
+    curve = float(np.polyfit(logs, costs, 2)[0])
+    return float(np.clip(1 / np.sqrt(max(curve, 1e-9)), 0.02, 0.5))

@@ -1,0 +1,110 @@
+"""Samples that were not renewed: seen in the record itself, and bridged before anything is fitted.
+
+A noisy measurement never repeats to the last digit, so a value that does was held. Its share is the
+strength of ``sensor_dropout``; its error, what the robot moved meanwhile, is nobody else's. Values
+on a lattice, as encoders give them, repeat by themselves, and say nothing.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Hold", "bridged"]
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..effects.robot import Robot
+from ..logs.finding import runs
+from ..logs.kinematics import lattice_step
+from ..logs.log import Log
+from ..logs.velocity import Windows, velocity
+
+_LEAST, _ROWS = 0.01, 10  # share of the rows, and rows, that are no accident
+_MOST = 0.6  # share beyond which the channel is sampled more slowly
+_MOVING = 0.2  # of the mean change: what a moving joint's neighbouring samples differ by
+_LONGEST = 12  # rows: a sample that stands still for longer is of a robot that does
+
+
+@dataclass(frozen=True)
+class Hold:
+    """A channel whose samples are sometimes not renewed.
+
+    Attributes:
+        channel: Its name.
+        share: Of the rows that repeat the one before.
+        error: Standard deviation of the share.
+    """
+
+    channel: str
+    share: float
+    error: float
+
+
+def bridged(logs: Sequence[Log], robot: Robot) -> tuple[list[Log], list[Hold]]:
+    """Return the logs with held samples replaced by straight lines, and the channels concerned.
+
+    Args:
+        logs: As recorded.
+        robot: Its channels; those of hinges and slides are looked at.
+    """
+    found, result = [], list(logs)
+    for number, channel in enumerate(robot.channels):
+        joint, kind = robot.channel_joint[number], robot.channel_kind[number]
+        if joint < 0 or kind not in {"position", "velocity"}:
+            continue
+        name = "qpos" if kind == "position" else "qvel"
+        index = (robot.qpos_index if kind == "position" else robot.dof_index)[joint]
+        columns = [getattr(log, name)[:, index].numpy() for log in result]
+        held = [_held(column) for column in columns]
+        rows, count = sum(int(h.sum()) for h in held), sum(len(h) - 1 for h in held)
+        share = rows / max(count, 1)
+        moving = sum(_moving(column, h) for column, h in zip(columns, held, strict=True))
+        if moving < max(_ROWS, _LEAST * count) or share > _MOST:
+            continue
+        found.append(Hold(channel, share, float(np.sqrt(share * (1 - share) / count))))
+        result = [
+            _replaced(log, name, index, h) if h.any() else log
+            for log, h in zip(result, held, strict=True)
+        ]
+        if kind == "position":
+            dof = robot.dof_index[joint]
+            result = [_slope(log, index, dof) for log in result]
+    return result, found
+
+
+def _held(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which samples repeat the one before, but for a few rows only."""
+    held = np.zeros(len(values), dtype=bool)
+    if len(values) < 3 or lattice_step(values) > 0:
+        return held
+    for first, last in runs(np.diff(values) == 0):
+        held[first + 1 : last + 2] = last - first < _LONGEST
+    return held
+
+
+def _moving(values: NDArray[np.float64], held: NDArray[np.bool_]) -> int:
+    """Return how many single samples are held between others that differ."""
+    change = np.abs(np.diff(values))
+    least = _MOVING * float(change.mean()) if len(change) else 0.0
+    return int((held[1:-1] & (change[1:] > least) & (np.append(np.inf, change[:-2]) > least)).sum())
+
+
+def _replaced(log: Log, name: str, index: int, held: NDArray[np.bool_]) -> Log:
+    values, time = getattr(log, name).clone(), log.time.numpy()
+    column = values[:, index].numpy()
+    column = np.interp(time, time[~held], column[~held])
+    values[:, index] = torch.from_numpy(column)
+    return replace(log, **{name: values})
+
+
+def _slope(log: Log, index: int, dof: int) -> Log:
+    """Return the log with the velocity estimated anew, where it was estimated."""
+    if not log.velocity_gain[dof]:
+        return log
+    speeds, gains = log.qvel.clone(), log.velocity_gain.clone()
+    slope, gain, _ = velocity(Windows(log.time.numpy()), log.qpos[:, index].numpy())
+    speeds[:, dof], gains[dof] = torch.from_numpy(slope), gain
+    return replace(log, qvel=speeds, velocity_gain=gains)

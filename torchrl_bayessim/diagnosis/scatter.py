@@ -1,0 +1,187 @@
+"""What the report says of effects of chance: findings, figures, candidates."""
+
+from __future__ import annotations
+
+__all__ = ["Scatter", "gap_with_holds"]
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..effects.effect import Effect
+from ..effects.robot import Robot
+from ..effects.sensors import SensorDropout
+from ..effects.units import unit_at
+from ..logs.log import Log
+from .chance import Chance
+from .holds import Hold
+from .objective import Objective, Point, Unit, strengths_of
+from .preparation import Prepared, cut_for_fits, split
+from .report import Candidate, Finding
+from .selection import Selection
+from .shrinkage import Shrinkage
+
+_DRAWS = 1000
+
+
+def gap_with_holds(prepared: Prepared, logs: Sequence[Log], selection: Selection) -> float:
+    """Return the mean squared innovation of test segments cut from the logs as recorded."""
+    test = prepared.sets["test"]
+    size = len(test.segments)
+    pieces = cut_for_fits(
+        split(logs)["test"], prepared.horizon, history=test.segments.history, most=size
+    )
+    if len(pieces) != size:
+        return 1.0
+    recorded = Objective(test.predictor, test.prior, pieces, test.whitening)
+    left = recorded([selection.nominal.fit.point])[0]
+    return float((left**2).sum() / (test.whitening.weights**2).sum() / left.shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """What was found of effects of chance.
+
+    Attributes:
+        found: Those that explain the scatter, the likeliest first.
+        least: Of each that was looked for, the least strength that would have been seen.
+        holds: Channels whose samples were not always renewed.
+        held: Mean squared innovation of test segments with the samples as they were recorded.
+    """
+
+    found: Sequence[Chance]
+    least: Mapping[Unit, float]
+    holds: Sequence[Hold]
+    held: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of what was found; the data do not tell them apart."""
+        return tuple(dict.fromkeys(chance.unit.name for chance in self.found))
+
+    @property
+    def groups(self) -> set[str]:
+        """The groups of what was found."""
+        return {chance.unit.effect.group for chance in self.found}
+
+    def measured(self, before: Shrinkage, generator: np.random.Generator) -> Shrinkage:
+        """Return how far the gap shrinks with the likeliest, standardised by its own scatter."""
+        left = self.found[0].left
+        draws = left[generator.integers(len(left), size=(_DRAWS, len(left)))].mean(1)
+        excess = max(before.refit - 1.0, 1e-9)
+        low, high = np.quantile(draws, [0.025, 0.975]).tolist()
+        after = float(left.mean())
+        share = [min((before.refit - value) / excess, 1.0) for value in (after, high, low)]
+        return replace(
+            before,
+            effects=after,
+            explained=share[0],
+            explained_ci=(share[1], share[2]),
+            remainder_ci=(low - 1.0, high - 1.0),
+        )
+
+    def with_holds(self, before: Shrinkage) -> Shrinkage:
+        """Return how far the gap of the samples as they were recorded shrinks."""
+        refit = max(self.held, before.refit)
+        excess = max(refit - 1.0, 1e-9)
+        share, high, low = (
+            float(np.clip((excess - left) / excess, 0.0, 1.0))
+            for left in (before.effects - 1.0, *before.remainder_ci)
+        )
+        return replace(
+            before,
+            raw=max(before.raw, refit),
+            refit=refit,
+            explained=share,
+            explained_ci=(low, high),
+            excess_ci=(max(before.excess_ci[0], 0.5 * (refit - 1.0)), refit - 1.0),
+        )
+
+    def held_findings(self, measured: Shrinkage, others: float) -> tuple[Finding, ...]:
+        """Return the channels whose samples are held, as the report has them.
+
+        Args:
+            measured: How far the gap shrinks.
+            others: The share that other effects have.
+        """
+        if not self.holds:
+            return ()
+        strengths = {hold.channel: hold.share for hold in self.holds}
+        mean = float(np.mean(list(strengths.values())))
+        half = 1.96 * float(np.mean([hold.error for hold in self.holds]))
+        return (
+            Finding(
+                name=SensorDropout.name,
+                where=next(iter(strengths)) if len(strengths) == 1 else "all",
+                strength=mean,
+                unit=SensorDropout.unit,
+                ci95=(max(mean - half, 0.0), mean + half),
+                p_value=0.0,
+                share_of_gap=max(measured.explained - others, 0.0),
+                strengths=strengths,
+            ),
+        )
+
+    def findings(self, measured: Shrinkage, robot: Robot) -> tuple[Finding, ...]:
+        """Return the likeliest as the report has it."""
+        first = self.found[0]
+        half = 1.96 * first.error
+        return (
+            Finding(
+                name=first.unit.name,
+                where=first.unit.where,
+                strength=first.strength,
+                unit=unit_at(first.unit.effect, robot, int(np.argmax(first.unit.direction))),
+                ci95=(max(first.strength - half, 0.0), first.strength + half),
+                p_value=float(np.exp(-first.gain / 2)),
+                share_of_gap=measured.explained,
+                strengths={first.unit.where: first.strength},
+            ),
+        )
+
+    def strengths(self, robot: Robot) -> dict[Effect, dict[str, float]]:
+        """Return the strength of the likeliest by target, as `Report.apply` sets it."""
+        first = self.found[0]
+        on = strengths_of([Point(np.zeros(1), {first.unit: first.strength})], robot)
+        return {
+            effect: dict(zip(effect.targets(robot), values[0].tolist(), strict=True))
+            for effect, values in on.items()
+        }
+
+    def candidates(self) -> list[Candidate]:
+        """Return what the data say of each that was looked for."""
+        found = {chance.unit: chance for chance in self.found}
+        first = self.found[0].unit if self.found else None
+        told = []
+        for unit, least in self.least.items():
+            chance = found.get(unit)
+            seen = bool(np.isfinite(least))
+            status = "ruled_out" if seen else "not_excited"
+            if unit.name == SensorDropout.name and self.holds:
+                status = "named" if unit.where in {h.channel for h in self.holds} else "rejected"
+            elif chance is not None:
+                status = "named" if unit == first else "confounded"
+            elif self.found:
+                status = "rejected"
+            told.append(
+                Candidate(
+                    name=unit.name,
+                    where=unit.where,
+                    strength=0.0 if chance is None else chance.strength,
+                    ci95=None
+                    if chance is None
+                    else (
+                        chance.strength - 1.96 * chance.error,
+                        chance.strength + 1.96 * chance.error,
+                    ),
+                    likelihood_ratio=0.0 if chance is None else chance.gain,
+                    p_value=1.0 if chance is None else float(np.exp(-chance.gain / 2)),
+                    held_out_gain=None,
+                    explained_fraction=0.0,
+                    explained_by_parameters=0.0,
+                    minimal_detectable_strength=least if seen else None,
+                    status=status,
+                )
+            )
+        return told
