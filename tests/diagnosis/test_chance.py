@@ -74,6 +74,8 @@ def test_held_samples_are_counted_and_nobody_else_is_blamed():
     assert found.strength == pytest.approx(0.1, abs=0.03)
     assert report.gap.refit > 5 > report.gap.with_effects
     assert "sensor_dropout" in report.to_dict()["confusion_set"]
+    (named,) = [c for c in report.candidates if c.status == "named"]
+    assert (named.where, named.strength) == ("hinge position", found.strength)
 
 
 def test_commands_that_are_rounded_are_named_with_their_step():

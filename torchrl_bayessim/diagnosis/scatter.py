@@ -6,6 +6,7 @@ __all__ = ["Scatter", "gap_with_holds"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -151,37 +152,38 @@ class Scatter:
 
     def candidates(self) -> list[Candidate]:
         """Return what the data say of each that was looked for."""
-        found = {chance.unit: chance for chance in self.found}
-        first = self.found[0].unit if self.found else None
-        told = []
-        for unit, least in self.least.items():
-            chance = found.get(unit)
-            seen = bool(np.isfinite(least))
-            status = "ruled_out" if seen else "not_excited"
-            if unit.name == SensorDropout.name and self.holds:
-                status = "named" if unit.where in {h.channel for h in self.holds} else "rejected"
-            elif chance is not None:
-                status = "named" if unit == first else "confounded"
-            elif self.found:
-                status = "rejected"
-            told.append(
-                Candidate(
-                    name=unit.name,
-                    where=unit.where,
-                    strength=0.0 if chance is None else chance.strength,
-                    ci95=None
-                    if chance is None
-                    else (
-                        chance.strength - 1.96 * chance.error,
-                        chance.strength + 1.96 * chance.error,
-                    ),
-                    likelihood_ratio=0.0 if chance is None else chance.gain,
-                    p_value=1.0 if chance is None else float(np.exp(-chance.gain / 2)),
-                    held_out_gain=None,
-                    explained_fraction=0.0,
-                    explained_by_parameters=0.0,
-                    minimal_detectable_strength=least if seen else None,
-                    status=status,
-                )
-            )
-        return told
+        return [self._candidate(unit, least) for unit, least in self.least.items()]
+
+    def _candidate(self, unit: Unit, least: float) -> Candidate:
+        strength, error, gain = self._known(unit)
+        return Candidate(
+            name=unit.name,
+            where=unit.where,
+            strength=strength,
+            ci95=(strength - 1.96 * error, strength + 1.96 * error) if strength else None,
+            likelihood_ratio=gain,
+            p_value=float(np.exp(-gain / 2)),
+            held_out_gain=None,
+            explained_fraction=0.0,
+            explained_by_parameters=0.0,
+            minimal_detectable_strength=least if np.isfinite(least) else None,
+            status=self._status(unit, least),
+        )
+
+    def _known(self, unit: Unit) -> tuple[float, float, float]:
+        """Return strength, its error and the deviance gained, zeros where it was not found."""
+        for hold in self.holds:
+            if (SensorDropout.name, hold.channel) == (unit.name, unit.where):
+                return hold.share, hold.error, (hold.share / hold.error) ** 2
+        for chance in self.found:
+            if chance.unit == unit:
+                return chance.strength, chance.error, chance.gain
+        return 0.0, 0.0, 0.0
+
+    def _status(self, unit: Unit, least: float) -> Any:
+        if self._known(unit)[0]:
+            held = unit.name == SensorDropout.name and self.holds
+            return "named" if held or unit == self.found[0].unit else "confounded"
+        if self.found or (self.holds and unit.name == SensorDropout.name):
+            return "rejected"
+        return "ruled_out" if np.isfinite(least) else "not_excited"
