@@ -14,6 +14,7 @@ from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.envs.stepper import Stepper
 from torchrl_bayessim.errors import PhysicsError
 from torchrl_bayessim.physics.consequences import DERIVED_FROM
+from torchrl_bayessim.physics.model_fields import resolve
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
 from torchrl_bayessim.physics.mujoco_models import MujocoModels
 from torchrl_bayessim.transforms import ApplyPhysics
@@ -165,7 +166,9 @@ def test_cloth_of_another_mass_hangs_as_in_a_model_of_its_own():
 REFUSED = """<mujoco><worldbody>
   <geom name="floor" type="plane" size="1 1 1"/>
   <body name="ball"><joint name="x" type="slide"/><geom name="g" size=".1"/><site name="s"/></body>
-  <body name="top" pos="0 0 1"><site name="t"/></body></worldbody>
+  <body name="top" pos="0 0 1"><site name="t"/></body>
+  <body name="free" pos="0 2 1"><freejoint name="f"/><geom size=".1" pos="1 0 0"/></body>
+  <body name="hand" mocap="true"/></worldbody>
   <tendon><spatial name="rope"><site site="s"/><site site="t"/></spatial></tendon>
   <actuator><motor name="m" joint="x"/></actuator></mujoco>"""
 
@@ -180,6 +183,24 @@ REFUSED = """<mujoco><worldbody>
         ("jnt_axis[x,0]", "mass matrix may change, to set jnt_axis, got 'ball'"),
         ("tendon_armature[rope]", "not zero in the nominal model"),
         ("jnt_range[x,0]", r"jnt_range that acts.*Try: set jnt_limited"),
+        ("jnt_margin[x]", "Try: set jnt_limited"),
+        ("jnt_solref[x,0]", "Try: set jnt_limited"),
+        ("jnt_solimp[x,0]", "Try: set jnt_limited"),
+        ("jnt_pos[f,0]", "a joint that is not free"),
+        ("body_pos[free,0]", "a body without a free joint.*Try: place it by its qpos"),
+        ("body_quat[free,0]", "a body without a free joint"),
+        ("body_pos[hand,0]", "a body that is not mocap.*Try: place it by mocap_pos"),
+        ("tendon_margin[rope]", "Try: set tendon_limited"),
+        ("tendon_solref_lim[rope,0]", "Try: set tendon_limited"),
+        ("tendon_solimp_lim[rope,0]", "Try: set tendon_limited"),
+        ("tendon_solref_fri[rope,0]", r"Try: set tendon_frictionloss\[0\] too"),
+        ("dof_solref[x,0]", r"Try: set dof_frictionloss\[0\] too"),
+        ("dof_solimp[x,2]", r"Try: set dof_frictionloss\[0\] too"),
+        ("geom_fluid[g,0]", "Try: set opt.density or opt.viscosity too"),
+        ("opt.wind[0]", "Try: set opt.density or opt.viscosity too"),
+        ("actuator_delay[m]", "Try: set nsample"),
+        ("actuator_cranklength[m]", "Try: set cranksite"),
+        ("actuator_lengthrange[m,0]", "a muscle as actuator"),
         ("actuator_ctrlrange[m,1]", "Try: set actuator_ctrllimited"),
         ("actuator_forcerange[m,1]", "Try: set actuator_forcelimited"),
         ("actuator_biasprm[m,1]", "Try: set actuator_biastype"),
@@ -194,6 +215,26 @@ def test_entries_that_cannot_be_set_or_to_no_effect_are_refused(target, match):
     for env in (Single(model), Batched(model)):
         with pytest.raises(PhysicsError, match=match):
             write(env, MujocoPhysics(target), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("idle", "along", "value"),
+    [
+        ("dof_solref[x,0]", "dof_frictionloss[x]", 0.3),
+        ("geom_fluid[g,0]", "opt.density", 5.0),
+        ("opt.wind[0]", "opt.viscosity", 0.5),
+    ],
+)
+def test_what_acts_together_with_another_entry_is_set_together_with_it(idle, along, value):
+    model = mujoco.MjModel.from_xml_string(REFUSED)
+    for physics in (MujocoPhysics(idle, along), MujocoPhysics(along, idle)):
+        for env in (Single(copy.copy(model)), Batched(model)):
+            assert (write(env, physics, value, value) == value).all()
+    models = ModelBatch(model, 2)  # and one after the other
+    for target in (along, idle):
+        place = resolve(model, target)
+        models.write(place.field, place.indices[0], np.full(2, value))
+    np.testing.assert_array_equal(models.read(place.field, place.indices[0]), value)
 
 
 class Single:

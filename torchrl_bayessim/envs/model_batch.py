@@ -11,6 +11,7 @@ from __future__ import annotations
 __all__ = ["ModelBatch"]
 
 import copy
+from collections.abc import Set
 
 import mujoco
 import numpy as np
@@ -97,7 +98,7 @@ class ModelBatch:
             chosen_rows(rows, self.num_envs)
         if (field, indices) not in self._columns:
             self._nominal(field, indices)  # or an error that says what there is
-            check_settable(self.model, field, indices)
+            check_settable(self.model, field, indices, along=self.places)
         check_values((field, indices), values if rows is None else values[rows])
         self.put(field, indices, values, rows)
 
@@ -197,6 +198,11 @@ class ModelBatch:
         if bad >= 0:
             expected = f"physics that MuJoCo can evaluate, not those of environment {bad}"
             raise SimulationError(message(expected, fault_text(scratch.fault)))
+
+    @property
+    def places(self) -> Set[_Place]:
+        """The entries that are overridden, or may be."""
+        return self._columns.keys()
 
     def resize(self, num_envs: int) -> None:
         """Change the number of environments; new ones have the nominal physics."""

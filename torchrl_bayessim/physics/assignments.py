@@ -4,6 +4,7 @@ from __future__ import annotations
 
 __all__ = ["Assignments", "assignments"]
 
+from collections.abc import Set
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import PhysicsError, message
 from .consequences import check_settable, lowest
+from .idle import Place
 from .model_fields import Entries
 
 
@@ -41,6 +43,9 @@ class Assignments:
 class _Models(Protocol):
     model: mujoco.MjModel
 
+    @property
+    def places(self) -> Set[Place]: ...
+
     def nominal(self, field: str, indices: tuple[int, ...]) -> float: ...
 
 
@@ -66,10 +71,11 @@ def assignments(models: _Models, groups: list[list[Entries]]) -> Assignments:
     rows: list[tuple[str, tuple[int, ...], int, float, float]] = []
     own: dict[int, list[int]] = {parameter: [] for parameter in range(len(groups))}
     every = [(parameter, entry) for parameter, group in enumerate(groups) for entry in group]
+    along = models.places | {(entry.field, at) for _, entry in every for at in entry.indices}
     # Masses first: they scale inertias, which may be parameters themselves.
     for parameter, entry in sorted(every, key=lambda pair: pair[1].field != "body_mass"):
         for indices in entry.indices:
-            check_settable(models.model, entry.field, indices)
+            check_settable(models.model, entry.field, indices, along=along)
             own[parameter].append(len(rows))
             rows.append((entry.field, indices, parameter, entry.sign, 1.0))
             if entry.field == "body_mass":

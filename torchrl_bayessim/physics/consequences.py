@@ -14,7 +14,7 @@ copied frames          places of frames that coincide with another              
 skipped computations   `SKIPPED`: not computed while all are zero in the model         `frames`
 simple bodies          `_SIMPLE`: their mass matrix is taken to be constant            refused
 sparsity               `_SPARSE`: the compiler has left no room if zero                refused
-nothing                `_IDLE`: without a flag that is an integer                      refused
+nothing                `idle`: no limit, muscle, friction, … in the model               refused
 what is itself so      `RESULTS`                                                       refused
 =====================  ==============================================================  ============
 """
@@ -32,11 +32,14 @@ __all__ = [
     "lowest",
 ]
 
+from collections.abc import Container
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PhysicsError, message
+from .idle import Place, check_acts
 
 SKIPPED = frozenset({
     "body_gravcomp", "geom_surfacevel", "geom_adhesion", "pair_adhesion",
@@ -61,13 +64,6 @@ RESULTS = frozenset({
 })  # fmt: skip
 _SIMPLE = {"body_ipos", "body_iquat", "jnt_pos", "jnt_axis"}
 _SPARSE = {"tendon_armature"}
-_IDLE = {  # the field: what must not be zero for it to act
-    "jnt_range": "jnt_limited", "jnt_actfrcrange": "jnt_actfrclimited",
-    "tendon_range": "tendon_limited", "tendon_actfrcrange": "tendon_actfrclimited",
-    "actuator_ctrlrange": "actuator_ctrllimited", "actuator_forcerange": "actuator_forcelimited",
-    "actuator_actrange": "actuator_actlimited",
-    "actuator_biasprm": "actuator_biastype", "actuator_dynprm": "actuator_dyntype",
-}  # fmt: skip
 _FREE = (
     mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER,
     mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_BOX,
@@ -111,8 +107,14 @@ def bad_value(place: tuple[str, tuple[int, ...]], got: float) -> PhysicsError:
     return PhysicsError(message(f"{entry} to be {kind}", got))
 
 
-def check_settable(model: mujoco.MjModel, field: str, indices: tuple[int, ...]) -> None:
-    """Refuse an entry that cannot be set, or to no effect.
+def check_settable(
+    model: mujoco.MjModel,
+    field: str,
+    indices: tuple[int, ...],
+    *,
+    along: Container[Place] = (),
+) -> None:
+    """Refuse an entry that cannot be set, or to no effect without those that are set along.
 
     Raises:
         PhysicsError: The message says why, and what to do instead.
@@ -132,10 +134,7 @@ def check_settable(model: mujoco.MjModel, field: str, indices: tuple[int, ...]) 
         raise PhysicsError(
             message(f"{field} that is not zero in the nominal model", row, hint=hint)
         )
-    flag = _IDLE.get(field)
-    if flag is not None and not _nominal(model, flag)[row]:
-        expected = f"a row of {field} that acts, with {flag} in the model"
-        raise PhysicsError(message(expected, f"{field}[{row}]", hint=f"set {flag} in the MJCF"))
+    check_acts(model, (field, indices), along)
     override = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE
     if field.startswith("opt.o_") and not override:
         hint = '<flag override="enable"/> in the MJCF'

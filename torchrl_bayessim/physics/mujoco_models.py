@@ -4,6 +4,7 @@ from __future__ import annotations
 
 __all__ = ["MujocoModels", "models_of"]
 
+from collections.abc import Set
 from typing import Any
 
 import mujoco
@@ -15,6 +16,7 @@ from .assignments import Assignments
 from .consequences import bad_value, check_settable, check_values
 from .frames import separate
 from .geom_bounds import fit_bounds
+from .idle import Place
 
 
 class MujocoModels:
@@ -38,6 +40,11 @@ class MujocoModels:
             self._nominal[field] = _array(self.model, field).copy()
         return float(self._nominal[field][indices])
 
+    @property
+    def places(self) -> Set[Place]:
+        """The entries that have been written."""
+        return self._written.keys() if self._batch is None else self._batch.places
+
     def read(self, field: str, indices: tuple[int, ...]) -> NDArray[np.float64]:
         """Return an entry, one number per environment."""
         if self._batch is not None:
@@ -60,7 +67,7 @@ class MujocoModels:
             self._batch.write(field, indices, values, rows)
         elif rows.all():
             if (field, indices) not in self._written:
-                check_settable(self.model, field, indices)
+                check_settable(self.model, field, indices, along=self.places)
             check_values((field, indices), values)
             self.put(field, indices, values, rows)
 
