@@ -304,6 +304,55 @@ def test_a_task_is_checked_when_it_is_made():
         pendulum(initial={"qpso": np.zeros(1)})
 
 
+def test_a_task_is_made_of_a_model():
+    for model in (None, "robot.xml"):
+        with pytest.raises(TypeError, match=r"an MjModel, got .*Try: mujoco.MjModel.from_xml_path"):
+            Task(model=model, frame_skip=1)
+    with pytest.raises(TypeError, match=r"names of outputs, got 'qpos'. Try: \('qpos',\)"):
+        pendulum(outputs="qpos")
+
+
+def test_a_misspelt_component_in_a_reset_is_refused_and_own_names_are_readings():
+    def reset(draws, name):
+        return {name: np.full((len(draws), 1), 0.25)}
+
+    with pytest.raises(KeyError, match=r"a name of your own .*got 'qpso'.*qpos \(did you mean"):
+        BatchedMujocoEnv(pendulum(reset=lambda draws: reset(draws, "qpso")), 2)
+    env = BatchedMujocoEnv(pendulum(reset=lambda draws: reset(draws, "wanted_height")), 2)
+    env.reset()
+    assert env.readings.wanted_height.tolist() == [[0.25], [0.25]]
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"dtype": torch.int64}, r"a floating dtype, .*got torch.int64. Available: torch"),
+        ({"seed": 1.5}, "an integer as seed, got 1.5"),
+        ({"threads": -1}, "threads to be a positive integer, got -1"),
+        ({"max_steps": True}, "max_steps to be a positive integer, got True"),
+    ],
+)
+def test_settings_of_another_kind_are_refused(change, match):
+    with pytest.raises(ValueError, match=match):
+        BatchedMujocoEnv(pendulum(), 2, **change)
+
+
+def test_numbers_and_actions_may_be_numpys():
+    env = BatchedMujocoEnv(pendulum(), np.int64(2), seed=np.int64(3))
+    twin = BatchedMujocoEnv(pendulum(), 2, seed=3)
+    assert env.batch_size == (2,)
+    actions = np.linspace(-1, 1, 8).reshape(2, 4, 1)
+    assert torch.equal(env.reset()["observation"], twin.reset()["observation"])
+    ahead = [e.open_loop(a) for e, a in ((env, actions), (twin, torch.from_numpy(actions)))]
+    assert torch.equal(ahead[0]["observation"], ahead[1]["observation"])
+
+
+def test_a_step_needs_an_action():
+    env = BatchedMujocoEnv(pendulum(), 2)
+    with pytest.raises((ValueError, KeyError), match="action"):
+        env.step(env.reset())
+
+
 def test_a_sequence_of_no_actions_is_refused():
     with pytest.raises(ValueError, match=r"T at least 1, got \(2, 0, 1\)"):
         BatchedMujocoEnv(pendulum(), 2).open_loop(torch.zeros(2, 0, 1))

@@ -164,9 +164,7 @@ def test_a_forked_process_steps_and_refreshes_with_threads_of_its_own():
 def test_a_fatal_error_without_a_message_is_still_an_error():
     stepper = Stepper(falling_boxes("1M"), 2, threads=1)
     stepper.status[:] = native.FAILED, 0
-    with pytest.raises(
-        SimulationError, match=r"environments \[0\], got 'a fatal error without"
-    ):
+    with pytest.raises(SimulationError, match=r"environments \[0\], got 'a fatal error without"):
         stepper._raise_failures(np.arange(2))
 
 

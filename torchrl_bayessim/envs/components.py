@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
-__all__ = ["check_counts", "chosen_rows", "components_of", "finite_rows", "names_of"]
+__all__ = [
+    "check_counts",
+    "check_own",
+    "check_settings",
+    "chosen_rows",
+    "components_of",
+    "finite_rows",
+    "names_of",
+]
 
+import difflib
 from collections.abc import Iterable
 
 import mujoco
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import message
@@ -91,6 +101,34 @@ def check_counts(**counts: object) -> None:
             continue
         if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
             raise ValueError(message(f"{name} to be a positive integer", value))
+
+
+def check_settings(dtype: torch.dtype, seed: object) -> None:
+    """Refuse what observations cannot be in, and what is no seed; None stands for a default.
+
+    Raises:
+        ValueError: ``dtype`` is not floating, or ``seed`` no integer.
+    """
+    if not dtype.is_floating_point:
+        expected = "a floating dtype, of observations and rewards"
+        raise ValueError(message(expected, dtype, available=["torch.float32", "torch.float64"]))
+    if seed is not None and not isinstance(seed, int | np.integer):
+        raise ValueError(message("an integer as seed", seed))
+
+
+def check_own(name: str, components: Iterable[str]) -> None:
+    """Refuse a name of a task's own that was probably meant to be a component of the state.
+
+    Example:
+        >>> check_own("goal", ["qpos", "qvel"])
+
+    Raises:
+        KeyError: It is nearly one.
+    """
+    known = list(components)
+    if difflib.get_close_matches(name, known, cutoff=0.7):
+        expected = "a component of the state, or a name of your own that is unlike all of them"
+        raise KeyError(message(expected, name, available=known))
 
 
 def names_of(outputs: Iterable[str]) -> tuple[str, ...]:

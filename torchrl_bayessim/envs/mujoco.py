@@ -19,13 +19,13 @@ from torchrl.envs import EnvBase
 
 from ..errors import message
 from .additions import Addition, rollout_with
-from .components import chosen_rows, finite_rows
+from .components import check_counts, check_own, check_settings, chosen_rows, finite_rows
 from .draws import Draws
 from .model_batch import ModelBatch
 from .specs import specs
 from .stepper import Stepper
 from .task import Readings, Task
-from .tasks.catalogue import known_task
+from .tasks.catalogue import as_task
 
 
 class BatchedMujocoEnv(EnvBase):
@@ -67,27 +67,22 @@ class BatchedMujocoEnv(EnvBase):
         max_steps: int | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        counts = {"num_envs": num_envs, "max_steps": max_steps, "threads": threads}
-        for name, value in counts.items():
-            if value is not None and not (isinstance(value, int) and value > 0):
-                raise ValueError(message(f"{name} to be a positive integer", value))
-        super().__init__(batch_size=torch.Size([num_envs]))
-        self.task = known_task(task) if isinstance(task, str) else task
-        if not isinstance(self.task, Task):
-            hint = "Task(model=..., frame_skip=...) for a model of your own"
-            raise TypeError(message("a task or the name of one", type(task).__name__, hint=hint))
-        self.num_envs = num_envs
+        check_counts(num_envs=num_envs, max_steps=max_steps, threads=threads)
+        check_settings(dtype, seed)
+        super().__init__(batch_size=torch.Size([int(num_envs)]))
+        self.task = as_task(task)
+        self.num_envs = int(num_envs)
         self.max_steps = max_steps or self.task.max_steps
         self._dtype = dtype
         self.stepper = Stepper(
             self.task.model,
-            num_envs,
+            self.num_envs,
             outputs=self.task.outputs,
             drive=self.task.drive,
             threads=threads,
         )
         self._additions: dict[object, Addition] = {}
-        self._seed = seed
+        self._seed = int(seed)
         self._episodes = np.zeros(num_envs, dtype=np.int64)
         self._elapsed = torch.zeros(num_envs, 1, dtype=torch.int64)
         self._extras: dict[str, Tensor] = {}
@@ -166,7 +161,7 @@ class BatchedMujocoEnv(EnvBase):
         Raises:
             ValueError: The shape is another, or an action is not finite.
         """
-        size = self.action_spec.shape[-1]
+        actions, size = torch.as_tensor(actions), self.action_spec.shape[-1]
         if actions.ndim != 3 or actions.shape != (self.num_envs, actions.shape[1] or 1, size):
             expected = f"actions of shape ({self.num_envs}, T, {size}), T at least 1"
             raise ValueError(message(expected, tuple(actions.shape)))
@@ -183,7 +178,8 @@ class BatchedMujocoEnv(EnvBase):
         return self._result(after, reward, elapsed, diverged)
 
     def _set_seed(self, seed: int | None) -> None:
-        self._seed = 0 if seed is None else seed
+        check_settings(self._dtype, seed)
+        self._seed = 0 if seed is None else int(seed)
         self._episodes[:] = 0
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
@@ -193,9 +189,10 @@ class BatchedMujocoEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
-        if action.shape != self.action_spec.shape:
+        if action is None or action.shape != self.action_spec.shape:
+            got = "none" if action is None else tuple(action.shape)
             expected = f"actions of shape {tuple(self.action_spec.shape)}"
-            raise ValueError(message(expected, tuple(action.shape)))
+            raise ValueError(message(expected, got))
         commands = self._commands(action.unsqueeze(1))
         self._outputs.reverse()
         self._readings.reverse()
@@ -237,6 +234,7 @@ class BatchedMujocoEnv(EnvBase):
                 part = stepper[name]
                 part[rows] = finite_rows(name, value, (len(rows), part.shape[1]))
             else:
+                check_own(name, stepper.components)
                 size = np.shape(value)[-1]
                 extra = self._extras.setdefault(name, torch.zeros(self.num_envs, size).double())
                 extra[rows] = torch.from_numpy(finite_rows(name, value, (len(rows), size)))

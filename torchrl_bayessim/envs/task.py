@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import message
-from .components import components_of
+from .components import components_of, names_of
 from .draws import Draws
 from .drive import Drive
 
@@ -72,8 +72,10 @@ class Task:
             positions and velocities.
         reward: ``(before, after, action) -> (*batch,)``; default zero.
         termination: ``readings -> (*batch,)`` boolean; default never.
-        reset: ``draws -> {component of the state or own name: (B, size)}``; default the model's
-            initial state.
+        reset: ``draws -> {name: (B, size)}``; default the model's initial state. A component of
+            the state (``qpos``, ``act``, ``mocap_pos``, …) is set; any other name, such as
+            ``goal``, is the task's own and appears in the readings. Own names that are nearly a
+            component's are an error.
         outputs: What to read, see `Stepper`.
         max_steps: Control steps before truncation.
         drive: How commands enter, see `Drive`.
@@ -82,6 +84,7 @@ class Task:
         initial: Components of the state at the start of every episode, before ``reset``.
 
     Raises:
+        TypeError: ``model`` is no MjModel, or ``outputs`` is one string.
         ValueError: ``frame_skip`` is not a positive integer.
         KeyError: ``initial`` has something that is no component of the state.
     """
@@ -100,6 +103,10 @@ class Task:
     initial: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.model, mujoco.MjModel):
+            hint = "mujoco.MjModel.from_xml_path(…)"
+            raise TypeError(message("an MjModel", self.model, hint=hint))
+        names_of(self.outputs)
         if not isinstance(self.frame_skip, int) or self.frame_skip < 1:
             raise ValueError(message("frame_skip to be a positive integer", self.frame_skip))
         known = components_of(self.model, welded=self.drive.weld is not None)
