@@ -2,6 +2,8 @@
 
 import importlib.util
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -24,6 +26,24 @@ def test_a_line_has_median_spread_ratios_seed_threads_and_versions(measuring, ca
     found = {key: line[key] for key in ("median", "min", "max", "runs", "seed", "threads", "n")}
     assert found == {"median": 2, "min": 1, "max": 6, "runs": 3, "seed": 3, "threads": 2, "n": 5}
     assert line["against"] == {"other": 1.0}  # the median of 1, 0.5 and 3: of ratios, not medians
-    assert {"mujoco", "torch", "torchrl", "numba"} <= line["versions"].keys()
+    assert {
+        "python",
+        "torchrl-bayessim",
+        "tensordict",
+        "mujoco",
+        "torch",
+        "torchrl",
+        "numba",
+    } <= line["versions"].keys()
     with pytest.raises(TypeError, match="seed"):
         measuring.report("b", "c", [1.0], threads=2)
+
+
+def test_misspelt_options_are_refused():
+    """In a process of its own: a benchmark imports its neighbours as scripts do."""
+    for script in ("batched_mujoco", "replay"):
+        command = [sys.executable, FILE.parent / f"{script}.py", "rnus=1"]
+        run = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert run.returncode == 1
+        assert "runs" in run.stderr
+        assert "got ['rnus']" in run.stderr

@@ -10,6 +10,9 @@ within a run:
 * ``open loop``: the same actions in one native call (``env.open_loop``);
 * ``gymnasium``: some of the same actions, one process, without TorchRL.
 
+``threads`` of a line are those of its case: one for ``gymnasium``, ``GymEnv`` and ``SerialEnv``
+whatever was asked for, and the two processes of ``ParallelEnv(2)``.
+
 Fetch has no case ``mujoco.rollout``, which cannot move a mocap body from where the gripper is.
 Prints one JSON line per case::
 
@@ -30,7 +33,7 @@ import gymnasium_robotics
 import mujoco
 import numpy as np
 import torch
-from measuring import compare, report
+from measuring import compare, options, report
 from mujoco import rollout
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -145,10 +148,11 @@ def bare(closed: Collecting, threads: int) -> Callable[[], int]:
 
 def main(*arguments: str) -> None:
     """Measure every case in turn."""
-    given = {"task": "Hopper-v5", "n": "256", "steps": "40", "runs": "5", "threads": "2"}
-    given |= dict(argument.split("=", 1) for argument in arguments)
-    name = given["task"]
-    n, steps, runs, threads = (int(given[key]) for key in ("n", "steps", "runs", "threads"))
+    named = [argument for argument in arguments if argument.startswith("task=")]
+    numbers = [argument for argument in arguments if argument not in named]
+    given = options(numbers, n=256, steps=40, runs=5, threads=2)
+    name = ("task=Hopper-v5", *named)[-1].removeprefix("task=")
+    n, steps, runs, threads = (given[key] for key in ("n", "steps", "runs", "threads"))
     torch.set_num_threads(1)
     torch.manual_seed(0)
     batched = vary(BatchedMujocoEnv(name, n, threads=threads))
@@ -173,7 +177,8 @@ def main(*arguments: str) -> None:
         rates = compare(cases, runs=runs)
     for key, values in rates.items():
         against = {other: rates[other] for other in rates if other != key}
-        context = {"task": name, "n": n, "threads": threads, "seed": 0}
+        workers = {"gymnasium": 1, "GymEnv": 1, "SerialEnv(4)": 1, "ParallelEnv(2)": 2}
+        context = {"task": name, "n": n, "threads": workers.get(key, threads), "seed": 0}
         report("batched_mujoco", key, values, against=against, **context)
 
 

@@ -12,12 +12,15 @@ from importlib.metadata import version
 
 __all__ = ["compare", "options", "report"]
 
-PACKAGES = ("torch", "torchrl", "mujoco", "gymnasium", "gymnasium-robotics", "numba")
+PACKAGES = (
+    "torchrl-bayessim", "torch", "torchrl", "tensordict", "mujoco", "gymnasium",
+    "gymnasium-robotics", "numba",
+)  # fmt: skip
 
 
 def options(arguments: list[str], **defaults: int) -> dict[str, int]:
     """Return ``name=value`` arguments over their defaults."""
-    given = dict(argument.split("=", 1) for argument in arguments)
+    given = {key: value for key, _, value in (a.partition("=") for a in arguments)}
     unknown = given.keys() - defaults
     if unknown:
         raise SystemExit(f"expected options {sorted(defaults)}, got {sorted(unknown)}")
@@ -92,4 +95,5 @@ def _provenance() -> Iterator[tuple[str, object]]:
     yield "cores", len(os.sched_getaffinity(0))
     yield "machine", platform.processor() or platform.machine()
     yield "load", round(os.getloadavg()[0], 1)
-    yield "versions", {name: version(name) for name in PACKAGES}
+    versions = {name: version(name) for name in PACKAGES}
+    yield "versions", {"python": platform.python_version(), **versions}
