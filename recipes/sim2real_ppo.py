@@ -63,7 +63,8 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
     torch.set_num_threads(1)  # batches are small: a second thread only costs
     task = chosen(settings)
     if settings.short:
-        settings.simulations, settings.updates = min(settings.simulations, 192), 2
+        settings.simulations = min(settings.simulations, 192)
+        settings.updates = settings.updates or 2
     truth = true_parameters(task, settings.truth, seed=settings.seed)
     score = Score(task, truth, episodes=16 if settings.short else 100)
     if settings.logger not in LOGGERS:

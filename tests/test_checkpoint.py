@@ -167,3 +167,10 @@ def test_killed_at_any_moment_the_file_is_whole(tmp_path):
         assert (state["x"] == state["i"]).all()
         save(file, {"after": 1})
         assert load(file) == {"after": 1}
+
+
+def test_a_folder_is_no_checkpoint(tmp_path):
+    with pytest.raises(IsADirectoryError, match="expected the file of a checkpoint"):
+        save(tmp_path, {"round": 1})
+    with pytest.raises(IsADirectoryError, match="name a file in it"):
+        load(tmp_path)

@@ -38,6 +38,7 @@ def save(path: str | os.PathLike[str], state: Mapping[str, Any]) -> None:
 
     Raises:
         TypeError: A value of another type; the message says where. Nothing is written then.
+        IsADirectoryError: The path is a folder.
 
     Example:
         >>> import tempfile
@@ -47,7 +48,7 @@ def save(path: str | os.PathLike[str], state: Mapping[str, Any]) -> None:
         {'round': 2, 'weight': tensor([1., 1.])}
     """
     content = {"format": _FORMAT, "schema": SCHEMA, "state": _plain(state, "state")}
-    path = Path(path).absolute()
+    path = _file(path).absolute()
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -66,9 +67,10 @@ def load(path: str | os.PathLike[str]) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: There is no such file.
+        IsADirectoryError: The path is a folder.
         ValueError: The file is truncated, damaged, of another program or of another schema.
     """
-    data = Path(path).read_bytes()
+    data = _file(path).read_bytes()
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             damaged = archive.testzip()  # torch.load does not verify the checksums
@@ -116,6 +118,15 @@ def _plain(value: Any, where: str) -> Any:
             hint="its state_dict(), or a tensor, number or string made from it",
         )
     )
+
+
+def _file(path: str | os.PathLike[str]) -> Path:
+    if Path(path).is_dir():
+        hint = "name a file in it, such as checkpoint.pt"
+        raise IsADirectoryError(
+            message("the file of a checkpoint", f"the folder {path}", hint=hint)
+        )
+    return Path(path)
 
 
 def _sync_folder(folder: Path) -> None:
