@@ -39,8 +39,9 @@ def test_displacement_is_mujocos(seed):
 
 
 @settings(deadline=None, max_examples=30)
-@given(st.integers(0, 10_000), st.floats(1e-9, 2.0))
+@given(st.integers(0, 10_000), st.floats(1e-9, 1.8))
 def test_displacement_undoes_difference(seed, size):
+    # a ball turns by less than half a turn: 1.8 √3 < π
     step = size * np.random.default_rng(seed).uniform(-1, 1, size=(3, MODEL.nv))
     start = position(seed)
     there = TANGENT.displace(start, step)
