@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from .consequences import SKIPPED
+from .derived import VIEW, derive
 
 _FLAGS = {
     "body_ipos": "body_sameframe",
@@ -25,7 +26,6 @@ _FLAGS = {
     "site_pos": "site_sameframe",
     "site_quat": "site_sameframe",
 }
-_VIEW = ("center", "extent", "meansize", "meanmass", "meaninertia")
 
 
 def separate(model: mujoco.MjModel, field: str, row: int) -> None:
@@ -67,11 +67,8 @@ def unskip(model: mujoco.MjModel, places: Iterable[tuple[str, tuple[int, ...]]])
     arrays = [getattr(model, name) for name in names]
     numbers = [array for array in arrays if np.issubdtype(array.dtype, np.floating)]
     before = [array.copy() for array in numbers]
-    view = {name: np.copy(getattr(model.stat, name)) for name in _VIEW}
     for field, indices in skipped:
         getattr(model, field)[indices] = 1.0
-    mujoco.mj_setConst(model, mujoco.MjData(model))
+    derive(model, mujoco.MjData(model), keep=(*VIEW, "meaninertia"))
     for array, old in zip(numbers, before, strict=True):
         array[...] = old
-    for name, value in view.items():
-        setattr(model.stat, name, value if value.ndim else float(value))

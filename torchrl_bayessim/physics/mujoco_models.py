@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..errors import PhysicsError, message
 from .assignments import Assignments
 from .consequences import bad_value, check_settable, check_values
+from .derived import derive
 from .frames import separate
 from .geom_bounds import fit_bounds
 from .idle import Place
@@ -128,12 +129,7 @@ class MujocoModels:
             fit_bounds(self, list(self._written), rows)
             if self._scratch is None:  # mj_setConst leaves its data at qpos0: not the simulator's
                 self._scratch = mujoco.MjData(self.model)
-            view = ("center", "extent", "meansize", "meanmass")  # may be set in the XML
-            stat = self.model.stat
-            before = {name: np.copy(getattr(stat, name)) for name in view}
-            mujoco.mj_setConst(self.model, self._scratch)
-            for name, value in before.items():
-                setattr(stat, name, value if value.ndim else float(value))
+            derive(self.model, self._scratch)
 
 
 def _array(model: mujoco.MjModel, field: str) -> NDArray[np.float64]:
