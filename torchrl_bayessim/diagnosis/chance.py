@@ -92,16 +92,25 @@ class _Data:
         return np.stack(found, 1)
 
     def _changed(self, points: Sequence[Point]) -> Array:
-        predictor, segments = self.objective.predictor, self.objective.segments
-        theta = self.objective.theta(np.stack([point.z for point in points]))
+        predictor = self.objective.predictor
         strengths = strengths_of(points, predictor.system.robot)
-        offsets = predictor.sensing.scattered(segments, strengths, seed=predictor.realisation)
-        residual = predictor.residuals(segments, theta, strengths, offsets)
+        seed = predictor.realisation
+        offsets = predictor.sensing.scattered(self.objective.segments, strengths, seed=seed)
+        return self.innovations(points, offsets) - self.left
+
+    def innovations(self, points: Sequence[Point], offsets: Array | None = None) -> Array:
+        """Return innovations without the robust weights, shape ``(P, S, M)``."""
         weights = self.objective.whitening.weights[:, None]
-        drift = self.objective.whitening.drift
-        share = np.array([point.z[-1] for point in points])
-        innovations = self.objective.whitening(residual) / weights
-        return innovations - share[:, None, None] * drift - self.left
+        return self.objective(points, offsets) / weights
+
+
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """What the judged segments say of a point: ``δ``, the deviance, the largest ``φ``."""
+
+    change: Array
+    cost: float
+    scatter: float
 
 
 def of_chance(units: Sequence[Unit]) -> list[Unit]:
@@ -123,7 +132,7 @@ def detectable(train: Objective, selection: Selection, units: Sequence[Unit]) ->
     """
     data, z = _Data.of(train, selection.nominal.fit.point), selection.nominal.fit.point.z
     result = {}
-    for unit in units:
+    for unit in units:  # one after the other, for memory's sake
         levels = np.array(_LEVELS) * unit.high
         points = [Point(z, {unit: float(level)}) for level in levels]
         added = (data.draws(points, _FEW) ** 2).mean((1, 2, 3))
@@ -149,10 +158,10 @@ def chances(
     judged = [_Data.of(sets[name], point) for name in ("train", "validation")]
     rows = [(unit, level * unit.high) for unit in units for level in _LEVELS]
     base = _without(judged, selection.best.fit.point)
-    costs = _costs(judged, rows, point)
+    told = _told(judged, [Point(point.z, {unit: strength}) for unit, strength in rows])
     best: dict[Unit, tuple[float, float]] = {}
-    for (unit, strength), cost in zip(rows, costs, strict=True):
-        best[unit] = min(best.get(unit, (np.inf, 0.0)), (cost, strength))
+    for (unit, strength), one in zip(rows, told, strict=True):
+        best[unit] = min(best.get(unit, (np.inf, 0.0)), (one.cost, strength))
     least = min(cost for cost, _ in best.values())
     if base - least < _NEEDED:
         return []
@@ -176,23 +185,19 @@ def _calm(selection: Selection) -> bool:
 
 def _without(judged: Sequence[_Data], point: Point) -> float:
     """Return the deviance of an explanation without chance, of evenly spread scatter."""
-    left = [d.objective([point])[0] / d.objective.whitening.weights[:, None] for d in judged]
+    left = [data.innovations([point])[0] for data in judged]
     squares, count = sum(float((r**2).sum()) for r in left), sum(r.size for r in left)
     return min(squares / phi + count * np.log(phi) for phi in _SCATTER)
 
 
-def _costs(
-    judged: Sequence[_Data], rows: Sequence[tuple[Unit, float]], point: Point
-) -> list[float]:
-    points = [Point(point.z, {unit: strength}) for unit, strength in rows]
+def _told(judged: Sequence[_Data], points: Sequence[Point]) -> list[_Told]:
     drawn = [data.draws(points) for data in judged]
-    costs = []
-    for p in range(len(rows)):
+    told = []
+    for p in range(len(points)):
         change = _change(judged[0], drawn[0][p])
-        costs.append(
-            sum(_deviance(data, d[p], change)[0] for data, d in zip(judged, drawn, strict=True))
-        )
-    return costs
+        found = [_deviance(data, d[p], change) for data, d in zip(judged, drawn, strict=True)]
+        told.append(_Told(change, sum(c for c, _, _ in found), max(phi for _, phi, _ in found)))
+    return told
 
 
 def _change(data: _Data, drawn: Array) -> Array:
@@ -249,18 +254,13 @@ def _refined(
     strengths = np.array([1.0, *_AROUND]) * strength
     strengths = np.unique(np.minimum(strengths, unit.high))
     points = [Point(point.z, {unit: float(s)}) for s in strengths]
-    drawn = [data.draws(points) for data in judged]
-    changes = [_change(judged[0], d) for d in drawn[0]]
-    told = [
-        [_deviance(data, d[p], change) for data, d in zip(judged, drawn, strict=True)]
-        for p, change in enumerate(changes)
-    ]
-    costs = np.array([sum(cost for cost, _, _ in one) for one in told])
+    told = _told(judged, points)
+    costs = np.array([one.cost for one in told])
     best = int(np.argmin(costs))
-    if max(phi for _, phi, _ in told[best]) > _CALM:
+    if told[best].scatter > _CALM:
         return None
     unseen = _Data.of(test, point)
-    after = _deviance(unseen, unseen.draws([points[best]])[0], changes[best])[2]
+    after = _deviance(unseen, unseen.draws([points[best]])[0], told[best].change)[2]
     return Chance(
         unit=unit,
         strength=float(strengths[best]),

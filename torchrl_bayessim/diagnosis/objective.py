@@ -146,17 +146,17 @@ class Objective:
         """Return parameters in their own units, shape ``(*, D)``."""
         return parameters_at(self.prior, z)
 
-    def raw(self, points: Sequence[Point]) -> Array:
-        """Return residuals, shape ``(P, S, K, C)``."""
+    def raw(self, points: Sequence[Point], offsets: Array | None = None) -> Array:
+        """Return residuals, shape ``(P, S, K, C)``; of sensors with ``offsets`` if given."""
         theta = self.theta(np.stack([point.z for point in points]))
         strengths = strengths_of(points, self.predictor.system.robot)
-        return self.predictor.residuals(self.segments, theta, strengths)
+        return self.predictor.residuals(self.segments, theta, strengths, offsets)
 
-    def __call__(self, points: Sequence[Point]) -> Array:
+    def __call__(self, points: Sequence[Point], offsets: Array | None = None) -> Array:
         """Return weighted innovations, shape ``(P, S, KC)``."""
         share = np.array([point.z[-1] for point in points])
         drift = self.whitening.drift * self.whitening.weights[:, None]
-        return self.whitening(self.raw(points)) - share[:, None, None] * drift
+        return self.whitening(self.raw(points, offsets)) - share[:, None, None] * drift
 
 
 def parameters_at(prior: Prior | None, z: Array) -> Array:
