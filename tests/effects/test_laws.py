@@ -73,6 +73,16 @@ def test_formulas(name, strength, given, expected):
     assert changed(name, strength, *given) == pytest.approx(expected)
 
 
+def test_a_drive_that_follows_within_the_step_acts_by_its_mean():
+    half = 0.1 / math.log(2)  # what is left halves in a step of 0.1 s
+    grid = np.linspace(0, 0.1, 10_001)
+    mean = 1 - np.trapezoid(np.exp(-grid / half), grid) / 0.1
+    values = changed("action_lag", half, 0, 1, 1, 1, held=False)
+    assert values == pytest.approx([0, mean, 1 - (1 - mean) / 2, 1 - (1 - mean) / 4])
+    assert changed("action_lag", 0.0, 0, 1, 2, held=False) == [0, 1, 2]
+    assert effect("action_lag").forms() == (effect("action_lag"), effect("action_lag", held=False))
+
+
 def test_a_battery_loses_no_more_than_half_again_of_its_sag():
     values = changed("battery_sag", 0.4, *[1.0] * 40, seconds=1.0)
     assert values[10] == pytest.approx(0.6)

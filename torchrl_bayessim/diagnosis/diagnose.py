@@ -142,4 +142,5 @@ def _system(simulator: str | Task | System, prior: BoxPrior | None) -> System:
 def _effects(system: System, effects: Sequence[str | Effect] | None) -> list[Effect]:
     if effects is None:
         effects = list(CATALOGUE) if system.effects is None else system.effects
-    return [effect(e) if isinstance(e, str) else e for e in effects]
+    forms = [effect(e).forms() if isinstance(e, str) else (e,) for e in effects]
+    return [form for some in forms for form in some]

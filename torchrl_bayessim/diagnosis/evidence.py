@@ -237,7 +237,11 @@ def _candidates(
     for unit, share in zip(seen.units, seen.swallowed.tolist(), strict=True):
         swallowed[unit] = max(swallowed.get(unit, 0.0), share)
     result = []
+    likely = sorted(strongest, key=lambda unit: (unit not in used, unit not in fitted))
+    forms = {str(unit): unit for unit in reversed(likely)}  # one law of each name and place
     for unit, (ratio, strength) in strongest.items():
+        if forms[str(unit)] is not unit:
+            continue
         model, ci, gain = fitted.get(unit), None, None
         if model is not None:
             strength = model.fit.point.strengths[unit]  # noqa: PLW2901 - the fit knows better

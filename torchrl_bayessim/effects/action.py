@@ -89,10 +89,22 @@ class ActionJitter(ActionEffect):
 class ActionLag(ActionEffect):
     """The drive follows the command with a time constant: ``a ← u + e^{−Δ/s} (a − u)``.
 
-    In seconds, 0 to 0.15; a first-order filter, exact for commands that are held.
+    In seconds, 0 to 0.15; a first-order filter. The controller's acts once per control step, and
+    what it has reached is held. A drive's goes on within the step, where its mean is
+    ``u + (s/Δ) (1 − e^{−Δ/s}) (a − u)``.
+
+    Args:
+        held: Whether it is the controller's.
     """
 
     name, unit, group = "action_lag", "s", "timing"
+
+    def __init__(self, *, held: bool = True) -> None:
+        self.held = held
+
+    def forms(self) -> tuple[Effect, ...]:
+        """Return the controller's and the drive's."""
+        return ActionLag(held=True), ActionLag(held=False)
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.15 s."""
@@ -105,10 +117,12 @@ class ActionLag(ActionEffect):
     def command(
         self, action: Tensor, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Tensor, Memory]:
-        """Return what the drive has reached."""
-        last = filled(memory["last"], action)
-        reached = action + decay(now.robot.dt, strength) * (last - action)
-        return reached, {"last": reached}
+        """Return what the drive has reached, or its mean over the step."""
+        behind = filled(memory["last"], action) - action
+        left = decay(now.robot.dt, strength)
+        reached = action + left * behind
+        mean = reached if self.held else action + strength / now.robot.dt * (1 - left) * behind
+        return mean, {"last": reached}
 
 
 class DeadBand(ActionEffect):

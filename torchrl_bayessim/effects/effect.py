@@ -96,6 +96,10 @@ class Effect(ABC):
         del robot
         return self
 
+    def forms(self) -> tuple[Effect, ...]:
+        """Return the laws that go by this name: a diagnosis that is given the name tries all."""
+        return (self,)
+
     @abstractmethod
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the names of what it can act on, empty where it does not apply."""
