@@ -165,6 +165,39 @@ def test_sensors_are_seen_through(name, strength, see):
     assert np.abs(predictor.residuals(cut([log], 10), np.zeros((1, 0)))).max() > 1e-2
 
 
+def late(true, columns, steps):
+    """Return a log whose readings arrive so many steps late."""
+    states = torch.cat([true.qpos, true.qvel], 1)
+    shifted = torch.cat([states[:1].expand(steps, -1), states[:-steps]])
+    states = torch.where(torch.tensor(columns), shifted, states)
+    fields = {n: getattr(true, n) for n in ("time", "ctrl", "velocity_gain", "measured")}
+    half = true.qpos.shape[1]
+    return Log(name="late", qpos=states[:, :half], qvel=states[:, half:], **fields)
+
+
+@pytest.mark.parametrize("columns", [(True, True, True, True), (False, True, False, True)])
+def test_late_readings_are_seen_through(columns):
+    system = System(task=arm())
+    log, predictor = late(recorded(arm()), columns, 2), Predictor(system, threads=1)
+    strengths = {effect("sensor_delay"): 2 * arm().dt * np.array([columns], dtype=float)}
+    segments = cut([log], 10, history=5)
+    segments = segments.take(np.arange(1, len(segments) - 1))  # of motion in mid-course
+    residual = predictor.residuals(segments, np.zeros((1, 0)), strengths)
+    assert np.abs(residual).max() < 1e-4
+    assert np.abs(predictor.residuals(segments, np.zeros((1, 0)))).max() > 1e-2
+
+
+def test_a_record_late_as_a_whole_is_one_of_late_commands():
+    predictor, segments = Predictor(System(task=arm()), threads=1), cut([recorded(arm())], 5)
+    both = {
+        effect("sensor_delay"): np.full((1, 4), 0.013),
+        effect("action_delay"): np.array([[0.0, 0.002]]),
+    }
+    one = {effect("action_delay"): np.array([[0.013, 0.015]])}
+    residuals = [predictor.residuals(segments, np.zeros((1, 0)), s) for s in (both, one)]
+    np.testing.assert_array_equal(*residuals)
+
+
 def test_a_diverging_candidate_is_nan_and_the_rest_unharmed():
     system = System(task=arm())
     predictor = Predictor(system, threads=1)

@@ -36,7 +36,7 @@ from ..logs.system import System
 from .commands import commanded
 from .segments import Segments
 from .sensing import Sensing
-from .strengths import Strengths
+from .strengths import Strengths, with_late_commands
 from .tangent import Tangent
 
 Array = NDArray[np.float64]
@@ -124,7 +124,7 @@ class Predictor:
         Returns:
             Shape ``(P, S, K, C)``; NaN where a simulation diverged.
         """
-        strengths = {} if strengths is None else strengths
+        strengths = with_late_commands(strengths or {}, len(self.system.robot.actuators))
         chunk = max(1, _ROWS // len(segments))
         parts = []
         for begin in range(0, len(theta), chunk):
@@ -144,7 +144,7 @@ class Predictor:
             theta: Parameters, shape ``(P, D)``.
             strengths: Of the effects that are on somewhere.
         """
-        strengths = {} if strengths is None else strengths
+        strengths = with_late_commands(strengths or {}, len(self.system.robot.actuators))
         restored = self.sensing.restored(segments, strengths, len(theta))
         simulated = self._simulate(segments, theta, strengths, restored=restored)
         nq = self.system.task.model.nq
