@@ -111,3 +111,27 @@ def test_other_priors_are_refused():
         report(DELAY).prior(GaussianPrior({"body_mass[pole]": (4.0, 1.0)}), ROBOT)
     with pytest.raises(ValueError, match="at least one named parameter"):
         report({}).prior(None, ROBOT)
+
+
+def test_an_effect_on_sensors_is_put_on_what_is_observed_of_them():
+    found = report({effect("sensor_bias"): {"hinge position": 0.1, "motor current": 0.4}, **DELAY})
+    with pytest.raises(ValueError, match=r"names of the observation's entries, for sensor_bias"):
+        make(found)
+    with pytest.raises(ValueError, match=r"channels=\('hinge position', 'motor current', ...\)"):
+        found.prior(None, ROBOT)
+    channels = ("slider position", "hinge position", "slider velocity", "hinge velocity")
+    bare = BatchedMujocoEnv(NAME, 3, threads=1)
+    both = [bare, found.apply(BatchedMujocoEnv(NAME, 3, threads=1), channels=channels)]
+    for env in both:
+        env.set_seed(0)
+    plain, biased = (env.reset()["observation"] for env in both)
+    torch.testing.assert_close(biased - plain, torch.tensor([0.0, 0.1, 0.0, 0.0]).expand(3, 4))
+    names = found.prior(None, ROBOT, channels=channels).names
+    assert names == ("sensor_bias[hinge position]", "action_delay[slide]")
+    physics = MujocoPhysics("body_mass[pole]")
+    env = found.apply(BatchedMujocoEnv(NAME, 3, threads=1), physics, channels=channels)
+    prior = found.prior(MASS, ROBOT, channels=channels)
+    env = TransformedEnv(env, DomainRandomizer(prior), auto_unwrap=True)
+    env.set_seed(0)
+    now = env.reset()
+    torch.testing.assert_close(now["observation"][:, 1] - plain[:, 1], now["theta"][:, 1])

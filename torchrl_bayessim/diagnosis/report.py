@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from ..effects.effect import Effect
+from ..effects.effect import Effect, SensorEffect
 from ..effects.robot import Robot
 from ..effects.units import unit_at
 from ..errors import message
@@ -205,7 +205,9 @@ class Report:
         text = json.dumps(_plain(self.to_dict()), indent=1, allow_nan=False)
         Path(path).write_text(text, encoding="utf-8")
 
-    def apply(self, env: EnvBase, physics: Physics | None = None) -> EnvBase:
+    def apply(
+        self, env: EnvBase, physics: Physics | None = None, *, channels: Sequence[str] = ()
+    ) -> EnvBase:
         """Return the environment with the effects that were found.
 
         With ``physics``, strengths are parameters too: the environment's θ has the columns of
@@ -215,20 +217,46 @@ class Report:
         Args:
             env: An environment of the simulator that was diagnosed.
             physics: Its parameters; default none, and strengths stay as they were fitted.
+            channels: What the report calls the entries of ``observation``, for effects on sensors;
+                any name for those that were not logged. What is not observed is left out.
+
+        Raises:
+            ValueError: An effect on sensors was found, and no channels are given.
         """
-        effects = [ApplyEffect(effect, dict(s)) for effect, s in self.strengths.items()]
+        strengths, named = self._strengths(channels), tuple(channels)
+        effects = [
+            ApplyEffect(e, dict(s), channels=named if isinstance(e, SensorEffect) else ())
+            for e, s in strengths.items()
+        ]
         if physics is None:
             for effect in effects:
                 env = TransformedEnv(env, effect, auto_unwrap=True)
             return env
-        pairs = zip(effects, self.strengths.values(), strict=True)
+        pairs = zip(effects, strengths.values(), strict=True)
         columns = [(effect, target) for effect, by_target in pairs for target in by_target]
         if columns:
             physics = EffectPhysics(physics, *columns)
         chain: list[Any] = [ApplyPhysics(physics), *effects]
         return TransformedEnv(env, Compose(*chain), auto_unwrap=True)
 
-    def prior(self, prior: BoxPrior | None, robot: Robot) -> BoxPrior:
+    def _strengths(self, channels: Sequence[str]) -> dict[Effect, Mapping[str, float]]:
+        """Return strengths by target, of channels those that an environment observes."""
+        result: dict[Effect, Mapping[str, float]] = {}
+        for effect, by_target in self.strengths.items():
+            seen = by_target
+            if isinstance(effect, SensorEffect):
+                if not channels:
+                    expected = f"the names of the observation's entries, for {effect.name}"
+                    hint = f"channels=({', '.join(map(repr, by_target))}, ...)"
+                    raise ValueError(message(expected, "none", hint=hint))
+                seen = {name: s for name, s in by_target.items() if name in channels}
+            if seen:
+                result[effect] = seen
+        return result
+
+    def prior(
+        self, prior: BoxPrior | None, robot: Robot, *, channels: Sequence[str] = ()
+    ) -> BoxPrior:
         """Return the prior over parameters and strengths of an environment of `apply`.
 
         A strength is uniform over what the catalogue has as plausible on this robot, or twice that
@@ -238,6 +266,7 @@ class Report:
         Args:
             prior: Over the parameters; ``None`` if there are none.
             robot: Such as `System.robot`.
+            channels: As given to `apply`.
 
         Raises:
             TypeError: The prior is another than a `BoxPrior`.
@@ -250,7 +279,7 @@ class Report:
             env.append_transform(DomainRandomizer(theta))
         """
         bounds, log, units = _described(prior)
-        for effect, by_target in self.strengths.items():
+        for effect, by_target in self._strengths(channels).items():
             targets = effect.targets(robot)
             low, high = (bound.tolist() for bound in effect.bounds(robot))
             for target, strength in by_target.items():
