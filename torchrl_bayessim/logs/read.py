@@ -66,9 +66,14 @@ def read_logs(source: Source, system: System) -> list[Log]:
 
 
 def _tables(path: Path, system: System) -> list[Table]:
-    if path.is_file():
+    try:
+        kind = "file" if path.is_file() else "folder" if path.is_dir() else ""
+    except OSError as error:
+        got = f"{str(path)[:200]}: {error.strerror}"
+        raise ValueError(message("a folder or file of logs", got)) from None
+    if kind == "file":
         return [_file_table(path, system)]
-    if not path.is_dir():
+    if not kind:
         raise ValueError(message("a folder or file of logs", str(path)))
     if (path / "data" / "metadata.json").is_file():
         return dataset_tables(path, system)
@@ -87,4 +92,6 @@ def _file_table(path: Path, system: System) -> Table:
         raise ValueError(message("a .csv or .parquet file", str(path)))
     if not path.is_file():
         raise ValueError(message("a file that exists", str(path)))
+    if not path.name.isprintable():  # findings name it, a line each
+        raise ValueError(message("a file name of printable letters", path.name))
     return reader(path, system.columns.used())

@@ -12,22 +12,27 @@ __all__ = ["Table", "dataset_tables", "read_csv", "read_parquet", "tensordict_ta
 
 import csv
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from importlib import import_module
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 
 from ..errors import message
 from .columns import default_columns
+from .memory_maps import saved_tensordict
 from .system import System
 
 Array = NDArray[np.float64]
+_BATCH = 50_000  # rows that are held as text
+_LONGEST = 1_000_000  # characters of a line
+_MOST = 100_000_000  # rows: a day at 1 kHz
 
 
 class Table(NamedTuple):
@@ -43,47 +48,80 @@ class Table(NamedTuple):
 
 
 def read_csv(path: Path, names: list[str]) -> Table:
-    """Return columns of a CSV file with a header row; an empty cell is NaN.
+    """Return columns of a CSV file with a header row.
+
+    An empty cell is NaN, and so is the last cell of a file that does not end with a line end, which
+    may be cut off.
 
     Raises:
-        ValueError: The file is empty or not text in UTF-8, has a column twice, a row with another
-            number of cells or a cell that is not a number, or lacks one of ``names``.
+        ValueError: The file cannot be read, is empty or not text in UTF-8, has a column twice, a
+            row with another number of cells or a cell that is not a number, or lacks one of
+            ``names``.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = [row for row in csv.reader(file) if row]
+            rows = (row for row in csv.reader(_lines(file, path.name)) if row)
+            return Table(path.name, _columns(rows, names, path.name))
     except UnicodeDecodeError:
         raise ValueError(message("a CSV file in UTF-8", str(path))) from None
     except csv.Error as error:
         raise ValueError(message(f"a CSV file in {path.name}", str(error))) from None
-    if len(rows) < 2:
-        raise ValueError(message(f"a header and rows in {path.name}", f"{len(rows)} rows"))
-    header = [name.strip() for name in rows[0]]
-    twice = sorted({name for name in header if header.count(name) > 1})
-    if twice:
-        raise ValueError(message(f"each column once in {path.name}", twice[0]))
-    _check_names(names, header, path.name)
-    for i, row in enumerate(rows[1:]):
-        if len(row) != len(header):
-            expected = f"{len(header)} cells in row {i} of {path.name}"
-            hint = "the file may be cut off: delete the row, or write it anew"
-            raise ValueError(message(expected, len(row), hint=hint))
-    columns = {name: _numbers(rows[1:], header.index(name), path.name, name) for name in names}
-    return Table(path.name, columns)
+    except OSError as error:
+        expected = "a file that can be read"
+        raise ValueError(message(expected, f"{path}: {error.strerror}")) from None
 
 
-def _numbers(rows: list[list[str]], column: int, file: str, name: str) -> Array:
-    cells = [row[column].strip() or "nan" for row in rows]
+def _lines(file: TextIO, name: str) -> Iterator[str]:
+    while line := file.readline(_LONGEST):
+        if not line.endswith(("\n", "\r")):
+            if len(line) == _LONGEST:
+                expected = f"lines of fewer than {_LONGEST} characters in {name}"
+                raise ValueError(message(expected, "a longer one"))
+            line = f'{line[: line.rfind(",") + 1]}""'
+        yield line
+
+
+def _columns(rows: Iterator[list[str]], names: list[str], file: str) -> dict[str, Array]:
+    """Return columns of numbers, from a batch of rows at a time."""
+    header = [name.strip() for name in next(rows, [])]
+    batch = list(islice(rows, _BATCH))
+    if not batch:
+        raise ValueError(message(f"a header and rows in {file}", "no rows"))
+    _check_twice(header, file)
+    _check_names(names, header, file)
+    parts: dict[str, list[Array]] = {name: [] for name in names}
+    start = 0
+    while batch:
+        for i, row in enumerate(batch, start):
+            if len(row) != len(header):
+                expected = f"{len(header)} cells in row {i} of {file}"
+                hint = "the file may be cut off: delete the row, or write it anew"
+                raise ValueError(message(expected, len(row), hint=hint))
+        for name in names:
+            column = header.index(name)
+            cells = [row[column].strip() or "nan" for row in batch]
+            parts[name].append(_numbers(cells, start, f"column {name!r} of {file}"))
+        start += len(batch)
+        _check_count(start, file)
+        batch = list(islice(rows, _BATCH))
+    return {name: np.concatenate(part) for name, part in parts.items()}
+
+
+def _numbers(cells: list[str], start: int, place: str) -> Array:
+    text = "".join(cells)
+    if text.isascii() and "_" not in text:  # Python takes 1_000 and digits of any script
+        with suppress(ValueError):
+            return np.array(cells, dtype=np.float64)
+    row, cell = next((i, cell) for i, cell in enumerate(cells, start) if not _is_number(cell))
+    raise ValueError(message(f"a number in row {row}, {place}", cell[:80]))
+
+
+def _is_number(cell: str) -> bool:
     try:
-        return np.array(cells, dtype=np.float64)
+        float(cell)
     except ValueError:
-        for i, cell in enumerate(cells):
-            try:
-                float(cell)
-            except ValueError:
-                expected = f"a number in row {i}, column {name!r} of {file}"
-                raise ValueError(message(expected, cell)) from None
-        raise
+        return False
+    return cell.isascii() and "_" not in cell
 
 
 def read_parquet(path: Path, names: list[str]) -> Table:
@@ -91,7 +129,8 @@ def read_parquet(path: Path, names: list[str]) -> Table:
 
     Raises:
         ImportError: pyarrow is not installed.
-        ValueError: It is not a Parquet file, or lacks one of ``names``, or one is not of numbers.
+        ValueError: It is not a Parquet file, has a column twice or lacks one of ``names``, or one
+            is not of numbers.
     """
     try:
         pyarrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
@@ -99,14 +138,17 @@ def read_parquet(path: Path, names: list[str]) -> Table:
         hint = "pip install torchrl_bayessim[recipes]"
         raise ImportError(message("pyarrow, to read Parquet", "none", hint=hint)) from None
     try:
-        _check_names(names, parquet.read_schema(path).names, path.name)
+        _check_count(parquet.read_metadata(path).num_rows, path.name)
+        header = parquet.read_schema(path).names
+        _check_twice(header, path.name)
+        _check_names(names, header, path.name)
         table = parquet.read_table(path, columns=names)
         columns = {}
         for name in names:
             column = table[name].combine_chunks().cast(pyarrow.float64())
             columns[name] = np.array(column.fill_null(np.nan).to_numpy(zero_copy_only=False))
-    except pyarrow.ArrowException as error:
-        reason = str(error).splitlines()[0]
+    except (pyarrow.ArrowException, OSError) as error:
+        reason = " ".join(str(error).split())[:200]
         raise ValueError(message(f"numbers in Parquet in {path.name}", reason)) from None
     return Table(path.name, columns)
 
@@ -147,12 +189,7 @@ def tensordict_tables(data: TensorDictBase | Path, system: System) -> list[Table
     name = "tensordict"
     if isinstance(data, Path):
         name = data.name
-        try:
-            data = TensorDict.load_memmap(data, allow_pickle=False)
-        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-            reason = str(error).splitlines()[0][:200]
-            expected = f"a tensordict without pickles in {name}"
-            raise ValueError(message(expected, reason)) from None
+        data = saved_tensordict(data)
     if not data.ndim:
         raise ValueError(message(f"a tensordict of batch size (*, T) in {name}", "none"))
     if 0 in data.shape:
@@ -167,8 +204,9 @@ def tensordict_tables(data: TensorDictBase | Path, system: System) -> list[Table
             if begin < end:
                 part = row[begin:end]
                 arrays = {
-                    ".".join((key,) if isinstance(key, str) else key): part.get(key).numpy()
-                    for key in part.keys(include_nested=True, leaves_only=True)
+                    ".".join((key,) if isinstance(key, str) else key): value.double().numpy()
+                    for key, value in part.items(include_nested=True, leaves_only=True)
+                    if isinstance(value, torch.Tensor) and not value.is_complex()
                 }
                 label = f"{name}[{len(tables)}]"
                 tables.append(_table(label, arrays, system))
@@ -213,9 +251,23 @@ def _by_joint(key: str, flat: Array, model: mujoco.MjModel) -> dict[str, Array]:
     return dict(zip(names, flat.T, strict=True)) if len(names) == flat.shape[1] else {}
 
 
+def _check_count(rows: int, file: str) -> None:
+    if rows > _MOST:
+        hint = "write several shorter logs"
+        raise ValueError(message(f"at most {_MOST} rows in {file}", rows, hint=hint))
+
+
+def _check_twice(header: list[str], file: str) -> None:
+    twice = sorted({name for name in header if header.count(name) > 1})
+    if twice:
+        raise ValueError(message(f"each column once in {file}", twice[0]))
+
+
 def _check_names(names: list[str], header: list[str], file: str) -> None:
     for name in names:
         if name not in header:
             hint = "name it under columns in system.yaml"
+            if len(header) == 1:
+                hint = "separate cells by commas"
             expected = f"a column of {file}"
             raise ValueError(message(expected, name, available=header, hint=hint))
