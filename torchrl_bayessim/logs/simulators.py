@@ -5,7 +5,7 @@
 ``dm_control:cartpole/swingup``  a task of the DeepMind Control Suite
 
 An MJCF file may include files and meshes of its own folder only, so that a description from
-elsewhere cannot read the rest of the disk.
+elsewhere cannot read the rest of the disk; see `model_files`.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ __all__ = ["simulator_task"]
 
 from dataclasses import replace
 from pathlib import Path
-from xml.etree import ElementTree
 
 import mujoco
+import numpy as np
 
 from ..envs.task import Task
 from ..envs.tasks.catalogue import known_task
 from ..errors import message
+from .model_files import check_model_files, inside
 
 
 def simulator_task(simulator: str, folder: Path, control_dt: float | None) -> Task:
@@ -63,7 +64,7 @@ def at_control_step(task: Task, control_dt: float) -> Task:
         ValueError: That is not a whole number of at least one.
     """
     timestep = task.model.opt.timestep
-    steps = round(control_dt / timestep) if 0 < control_dt < 1e6 else 0
+    steps = round(control_dt / timestep) if 0 < control_dt < 1e6 and timestep > 0 else 0
     if steps < 1 or abs(steps * timestep - control_dt) > 1e-6 * control_dt:
         hint = "change the model's <option timestep> or control_dt"
         expected = f"control_dt to be a multiple of the model's time step {timestep:g} s"
@@ -85,47 +86,33 @@ def _suite_task(name: str) -> Task:
 
 
 def _compiled(folder: Path, name: str) -> mujoco.MjModel:
-    path = _inside(folder, Path(name), name)
-    _check_files(folder.resolve(), path, seen=set())
+    folder = folder.resolve()
+    path = inside(folder, folder / name, name)
+    if not path.is_file():
+        available = sorted(p.name for p in folder.glob("*.xml"))
+        raise ValueError(message("a file that exists", name, available=available))
+    check_model_files(folder, path)
     try:
-        return mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except (ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(message(f"an MJCF file that compiles in {name}", reason)) from None
+    _check_numbers(model, name)
+    return model
 
 
-def _inside(folder: Path, name: Path, shown: str) -> Path:
-    path = (folder / name).resolve()
-    if not path.is_relative_to(folder.resolve()):
-        raise ValueError(message("files inside the folder of system.yaml", shown))
-    if not path.is_file():
-        available = [p.name for p in folder.glob("*.xml")]
-        raise ValueError(message("a file that exists", shown, available=available))
-    return path
+def _check_numbers(model: mujoco.MjModel, name: str) -> None:
+    """Raise a ValueError if the model holds NaN or a number that no simulation survives."""
+    parts = {"option": model.opt, "statistic": model.stat, "model": model}
+    for part, owner in parts.items():
+        for key in dir(owner):
+            value = getattr(owner, key) if not key.startswith("_") else None
+            if isinstance(value, float | np.ndarray) and np.asarray(value).dtype.kind == "f":
+                wrong = np.asarray(value)[~(np.abs(value) < _LARGEST)]
+                if wrong.size:
+                    got = f"{key} {wrong.flat[0]:g} of the {part}"
+                    expected = f"numbers below {_LARGEST:g} in {name}"
+                    raise ValueError(message(expected, got))
 
 
-def _check_files(folder: Path, path: Path, *, seen: set[Path]) -> None:
-    """Follow everything that a file of the model refers to."""
-    if path in seen:
-        return
-    seen.add(path)
-    try:
-        root = ElementTree.parse(path).getroot()  # expat bounds entity expansion
-    except (ElementTree.ParseError, ValueError) as error:
-        raise ValueError(message(f"XML in {path.name}", str(error))) from None
-    roots = [path.parent]
-    for element in root.iter("compiler"):
-        roots += [path.parent / element.get(key, "") for key in _FOLDERS]
-    for element in root.iter():
-        for key, value in element.attrib.items():
-            if not key.startswith("file"):
-                continue
-            found = [(place / value).resolve() for place in roots]
-            if not all(file.is_relative_to(folder) for file in found):
-                raise ValueError(message("files inside the folder of system.yaml", value))
-            for file in found:
-                if element.tag in {"include", "model"} and file.is_file():
-                    _check_files(folder, file, seen=seen)
-
-
-_FOLDERS = ("meshdir", "texturedir", "assetdir")
+_LARGEST = 1e15
