@@ -28,23 +28,41 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict:  # noqa: FBT001, FBT002
-        keys = [key.value for key, _ in node.value]
-        twice = [key for key in keys if keys.count(key) > 1]
-        if twice:
-            raise yaml.YAMLError(f"the key {twice[0]!r} twice")
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise yaml.YAMLError("a key that is no text")
+            if key.value in seen:
+                raise yaml.YAMLError(f"the key {key.value!r} twice")
+            seen.add(key.value)
         return super().construct_mapping(node, deep=deep)
+
+
+_Loader.yaml_constructors = {  # of SafeLoader's, without its numbers, dates, sets and bytes
+    tag: make
+    for tag, make in yaml.SafeLoader.yaml_constructors.items()
+    if tag in {None, *(f"tag:yaml.org,2002:{name}" for name in ("str", "seq", "map"))}
+}
+_LARGEST = 100_000  # bytes
 
 
 def read_description(path: Path) -> Description:
     """Return a YAML file's contents.
 
     Raises:
-        ValueError: There is no such file, or it is not plain YAML in UTF-8.
+        ValueError: There is no such file, or it is not plain YAML in UTF-8 of at most 100 kB.
     """
     try:
+        if path.exists() and not path.is_file():  # a pipe or a device has no end
+            raise ValueError(message("a file to read", f"{path}, which is none"))
+        if path.exists() and path.stat().st_size > _LARGEST:
+            got = f"{path.stat().st_size} bytes"
+            raise ValueError(message(f"at most 100 kB of YAML in {path.name}", got))
         value = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
     except OSError as error:
-        raise ValueError(message("a file to read", f"{path}: {error.strerror}")) from None
+        raise ValueError(
+            message("a file to read", f"{str(path)[:200]}: {error.strerror}")
+        ) from None
     except UnicodeDecodeError:
         raise ValueError(message("YAML in UTF-8", str(path))) from None
     except (yaml.YAMLError, RecursionError) as error:
@@ -87,8 +105,11 @@ class Description:
         return self
 
     def inner(self, key: str) -> Description:
-        """Return the mapping under a key, empty where there is none."""
-        return Description(self._value.get(key), f"{self._place}: {key}")
+        """Return the mapping under a key, empty where the key is not there."""
+        place = f"{self._place}: {key}"
+        if self._value.get(key) in ("", None) and key in self._value:
+            raise ValueError(message(f"something in {place}", "nothing", hint="leave out the key"))
+        return Description(self._value.get(key), place)
 
     def is_mapping(self, key: str) -> bool:
         """Return whether there is a mapping under a key."""
@@ -105,7 +126,8 @@ class Description:
         """Return a list of texts; a single one counts as a list."""
         value = self._value.get(key)
         values = [value] if isinstance(value, str) and value else value
-        if not isinstance(values, list) or not all(isinstance(v, str) and v for v in values):
+        texts = isinstance(values, list) and all(isinstance(v, str) and v for v in values)
+        if not texts or not values:
             raise ValueError(message(f"names under {key!r} in {self._place}", _short(value)))
         return tuple(values)
 
@@ -123,10 +145,13 @@ class Description:
 
 
 def _number(value: object, place: str) -> float:
+    text = str(value)
     try:
-        return float(str(value))
+        if text.isascii() and "_" not in text:  # Python takes 1_000 and digits of any script
+            return float(text)
     except ValueError:
-        raise ValueError(message(f"a number under {place}", _short(value))) from None
+        pass
+    raise ValueError(message(f"a number under {place}", _short(value)))
 
 
 def _short(value: object) -> object:

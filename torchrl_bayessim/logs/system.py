@@ -70,7 +70,8 @@ class System:
 
     Raises:
         ValueError: The columns or the noise do not fit the model, the prior is over other
-            parameters than the physics, or the task's actions are not its controls.
+            parameters than the physics, an effect is named twice, or the task's actions are not its
+            controls.
         PhysicsError: The model has no such parameter.
     """
 
@@ -99,6 +100,10 @@ class System:
                 raise ValueError(message("a channel in noise", name, available=known))
             if not 0 <= value < math.inf:
                 raise ValueError(message(f"a standard deviation of {name}, 0 or more", value))
+        effects = self.effects or ()
+        if len(set(effects)) < len(effects):
+            twice = next(name for name in effects if effects.count(name) > 1)
+            raise ValueError(message("each effect once", twice))
 
     @classmethod
     def load(cls, path: str | Path) -> System:
@@ -179,7 +184,7 @@ def _columns(read: Description) -> Columns:
 def _parameters(task: Task, read: Description) -> tuple[MujocoPhysics | None, BoxPrior | None]:
     entries: dict[str, tuple[str, ...]] = {}
     bounds: dict[str, tuple[float, float]] = {}
-    log = []
+    log, written = [], set()
     for name in read:
         entries[name] = (name,)
         inner = read
@@ -192,7 +197,11 @@ def _parameters(task: Task, read: Description) -> tuple[MujocoPhysics | None, Bo
         low, high = inner.numbers(key, 2)
         bounds[name] = low, high
         for entry in entries[name]:
-            resolve(task.model, entry)
+            target = resolve(task.model, entry)
+            places = {(target.field, index) for index in target.indices}
+            if places & written:
+                raise ValueError(message("each entry of the model in one parameter", entry))
+            written |= places
     if not bounds:
         return None, None
     physics = MujocoPhysics(**entries)
