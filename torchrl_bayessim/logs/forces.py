@@ -33,6 +33,7 @@ from .system import System
 Array = NDArray[np.float64]
 Terms = tuple[Array, ...]
 _WINDOW = 0.1  # s
+_EFFORT = 5  # times the largest force there is, in half of the rows
 _CONTACT = 3  # windows from a contact or limit within which nothing is said
 
 
@@ -72,6 +73,7 @@ def check_forces(
             yield from _commands(name, joint, servos[0], usable=usable, model=model)
         else:
             yield from _actions(name, [fit for *_, fit in fits])
+            yield from _effort(name, [terms for _, _, terms, *_ in fits])
         if not fits:
             continue
         spread = float(np.median([fit.spread for *_, fit in fits]))
@@ -200,6 +202,17 @@ def _actions(joint: str, fits: Sequence[Fit]) -> Iterator[Finding]:
     elif slope + 5 * error < 0.03 or slope - 5 * error > 10:
         text = f"the actions at {joint} act {slope:.2g} times as much as in the model: units?"
         yield Finding(kind="action_scale", file="", rows=(0, 0), message=text)
+
+
+def _effort(joint: str, fits: Sequence[Terms]) -> Iterator[Finding]:
+    """Find motion that takes far more force than there is, friction and parameters aside."""
+    ratios = []
+    for needed, actuated, bias, _ in fits:
+        most = np.abs(actuated).max() + np.abs(bias).max()
+        ratios.append(np.median(np.abs(needed - bias)) / (most + 1e-12))
+    if ratios and (times := float(np.median(ratios))) > _EFFORT:
+        text = f"{joint} moves as with {times:.2g} times the force of its actuators: units?"
+        yield Finding(kind="effort", file="", rows=(0, 0), message=text)
 
 
 def _is_servo(model: mujoco.MjModel, actuator: int, joint: int) -> bool:

@@ -23,6 +23,7 @@ from .record import Record, plausible, unwrapped, wraps
 from .system import System
 
 Array = NDArray[np.float64]
+_CLEAR = 30.0  # times the noise that a motion must be for what it says to count
 _RATIOS = {  # change of position by integrated velocity: what that means
     57.3: "positions are in degrees, velocities in radians",
     1 / 57.3: "velocities are in degrees, positions in radians",
@@ -135,7 +136,51 @@ def _agreement(motion: Motion, velocity: Array, time: Array) -> Iterator[Found]:
             return
         if correlation > 0.9:
             yield from _lag(change, travelled, span, steps)
+    if text := _mismatch(motion, velocity, (moved, integrated), steps):
+        yield "velocity_mismatch", everywhere, text, "error"
+        return
     yield from _outliers(motion, change - travelled, velocity, steps)
+
+
+def _mismatch(
+    motion: Motion, velocity: Array, over: tuple[Array, Array], steps: Array
+) -> str | None:
+    """Say how a velocity is another quantity, where motion and velocity are far above noise."""
+    (moved, integrated), span = over, len(steps) - len(over[0]) + 1
+    dt = np.median(steps)
+    told = moved.std() / (_noise(motion.position) + lattice_step(motion.position) + 1e-12)
+    if told > _CLEAR and np.ptp(velocity) == 0:
+        return "moves while its velocity never changes"
+    noise = dt * (_noise(velocity) * span**0.5 + lattice_step(velocity) * span) + 1e-12
+    if min(told, integrated.std() / noise) < _CLEAR:
+        return None
+    usual = np.abs(moved) < 6 * np.median(np.abs(moved)) + 1e-12  # without jumps
+    usual &= np.abs(integrated) < 6 * np.median(np.abs(integrated)) + 1e-12
+    for rows in usual, np.ones(len(moved), dtype=bool):
+        if rows.sum() < 10 or min(moved[rows].std(), integrated[rows].std()) == 0:
+            continue
+        ratio = moved[rows].std() / integrated[rows].std()
+        if _likeness(moved, integrated, rows) > 0.9 and 1 / 3 < ratio < 3:
+            return None
+    return "does not move as its velocity says: are columns swapped?"
+
+
+def _noise(values: Array) -> float:
+    """Return the standard deviation of white noise on values, from their third differences."""
+    return float(1.4826 * np.median(np.abs(np.diff(values, 3))) / np.sqrt(20))
+
+
+def _likeness(first: Array, second: Array, rows: NDArray[np.bool_]) -> float:
+    """Return the largest correlation in rows of two series up to ten rows apart."""
+    reach = min(10, len(first) // 10)
+    found = [0.0]
+    for lag in range(-reach, reach + 1):
+        inner = rows & np.roll(rows, lag)
+        inner[:reach] = inner[len(inner) - reach :] = False
+        pair = first[inner], np.roll(second, lag)[inner]
+        if inner.sum() > 2 and min(pair[0].std(), pair[1].std()) > 0:
+            found.append(abs(float(np.corrcoef(*pair)[0, 1])))
+    return max(found)
 
 
 def _over(values: Array, span: int) -> Array:

@@ -15,6 +15,7 @@ from .system import System
 from .tables import Table
 
 Array = NDArray[np.float64]
+_LATEST = 1e20  # s, beyond nanoseconds since 1970
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -23,7 +24,7 @@ class Record:
 
     Attributes:
         name: The file's name.
-        time: Seconds, shape ``(T,)``.
+        time: Seconds, shape ``(T,)``; NaN where it is no time.
         qpos: Shape ``(T, nq)``; quaternions are normalised and do not change sign between rows.
         qvel: Shape ``(T, nv)``.
         ctrl: The action held from each row on, shape ``(T, nu)``.
@@ -66,7 +67,8 @@ def record_of(table: Table, system: System) -> Record:
     if columns.time is None:
         time = system.control_dt * np.arange(length, dtype=np.float64)
     else:
-        time = table.columns[columns.time].copy()
+        time = table.columns[columns.time]
+        time = np.where(np.abs(time) < _LATEST, time, np.nan)
     return Record(name=table.name, time=time, qpos=qpos, qvel=qvel, ctrl=ctrl)
 
 
@@ -103,11 +105,23 @@ def _continuous(quaternions: Array, file: str, joint: str) -> Array:
 def wraps(angle: Array) -> NDArray[np.bool_]:
     """Return after which rows an angle jumps by a turn, which no motion does, shape ``(T - 1,)``.
 
+    Where it changes by more than half a turn before or after as well, other than back, it is no
+    jump: rows are too far apart, or the angle is in degrees.
+
     Example:
         >>> wraps(np.array([3.0, 3.1, -3.1, -3.0])).tolist()
         [False, True, False]
+        >>> wraps(np.array([0.0, 5.0, 11.0, 17.0])).tolist()
+        [False, False, False]
     """
-    return np.abs(np.abs(np.diff(angle)) - 2 * np.pi) < 1.5
+    change = np.diff(angle)
+    turn = np.abs(np.abs(change) - 2 * np.pi) < 1.5
+    beside = np.concatenate([[0.0], change, [0.0]])
+    alone = [
+        (np.abs(other) < np.pi) | (np.abs(change + other) < np.pi) | np.isnan(other)
+        for other in (beside[:-2], beside[2:])
+    ]
+    return turn & alone[0] & alone[1]
 
 
 def unwrapped(angle: Array) -> Array:

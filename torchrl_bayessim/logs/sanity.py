@@ -144,10 +144,14 @@ def _resolution(records: Sequence[Record], system: System) -> Iterator[Finding]:
 def _actions(records: Sequence[Record], system: System) -> Iterator[Finding]:
     model = system.task.model
     for i, name in enumerate(actuator_names(model)):
-        values = [r.ctrl[:, i][plausible(r.ctrl[:, i])] for r in records]
-        values = [v for v in values if len(v)]
-        if all(np.ptp(v) == 0 for v in values):
-            yield _general("constant_action", f"the action {name} never changes")
+        every = [r.ctrl[:, i][plausible(r.ctrl[:, i])] for r in records]
+        values = [v for v in every if len(v)]
+        constant = [r for r, v in zip(records, every, strict=True) if len(v) and np.ptp(v) == 0]
+        text = f"the action {name} never changes"
+        if len(constant) == len(values):
+            yield _general("constant_action", text)
+        else:
+            yield from (_whole("constant_action", record, text) for record in constant)
         low, high = model.actuator_ctrlrange[i]
         largest = max((np.abs(v).max() for v in values), default=0.0)
         if model.actuator_ctrllimited[i] and largest > 1.5 * max(-low, high):

@@ -21,7 +21,7 @@ def check_time(record: Record, control_dt: float) -> Iterator[Finding]:
     unknown = ~np.isfinite(time)
     backward = _not_after(np.where(unknown, -np.inf, time)) & ~unknown
     repeated = backward & np.isin(time, time[~backward & ~unknown])
-    yield from _rows(record, unknown, "not_finite_time", "the time is missing")
+    yield from _rows(record, unknown, "not_finite_time", "the time is missing or no time")
     yield from _rows(record, repeated, "repeated_time", "a time that a row before has")
     yield from _rows(record, backward & ~repeated, "backward_time", "the time goes backwards")
     rows = np.flatnonzero(~unknown & ~backward)
