@@ -31,6 +31,7 @@ from torchrl_bayessim.logs.system import System
 
 STAGES = 6  # of a search that ends after one round
 SHORTEST = 10  # control steps that a log must have where no horizon is given
+LONGEST = 10_000
 
 
 @dataclass
@@ -74,6 +75,8 @@ def read(settings: Diagnosis) -> tuple[System, list[Log], list[Finding]]:
             raise ValueError(message(f"{name}=PATH", "none"))
     if settings.horizon < 0:
         raise ValueError(message("a horizon of 1 or more, or 0 to choose one", settings.horizon))
+    if settings.horizon > LONGEST:
+        raise ValueError(message(f"a horizon of at most {LONGEST} steps", settings.horizon))
     system = System.load(settings.system)
     records = kept(read_records(settings.data, system), settings.leave_out)
     findings = check(records, system, horizon=settings.horizon or SHORTEST)
@@ -96,7 +99,13 @@ def kept(records: list[Record], leave_out: str) -> list[Record]:
 
 def chosen(effects: str) -> list[str] | None:
     """Return the names of the effects to consider, ``None`` for the system's own."""
-    return [name.strip() for name in effects.split(",")] if effects else None
+    if not effects:
+        return None
+    names = [name.strip() for name in effects.split(",")]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(message("each effect once", twice))
+    return names
 
 
 @contextmanager

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,10 +24,12 @@ from typing import Any, TypeVar
 import torch
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from torchrl_bayessim.errors import BayesSimError, message
 
 PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "torchrl_bayessim")
+SEEDS = 2**32
 FREE = ("progress", "debug", "logger")  # settings that a resumed run may change
 
 
@@ -44,29 +47,65 @@ S = TypeVar("S", bound=Settings)
 
 
 def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> None:
-    """Run ``job(settings, folder)`` with the command line's settings, and report its result."""
+    """Run ``job(settings, folder)`` with the command line's settings, and report its result.
+
+    The settings are written before the job where a run can be resumed, and with its result
+    otherwise: input that is refused leaves the folder as it was.
+    """
     name = Path(sys.argv[0]).stem
     start = time.monotonic()
     debug = "debug=true" in sys.argv[1:]
+    made: list[Path] = []
     try:
         settings = parse(settings_type, sys.argv[1:])
         folder = Path(settings.out or f"outputs/{name}/{datetime.now():%Y-%m-%d_%H-%M-%S}")
-        folder.mkdir(parents=True, exist_ok=True)
-        write(folder / "settings.json", json.dumps(dataclasses.asdict(settings)) + "\n")
+        made = opened(folder)
+        if hasattr(settings, "resume"):
+            note(settings, folder)
         result = job(settings, folder)
     except (ValueError, TypeError, KeyError, OSError, ImportError, BayesSimError) as error:
+        leave(made)
         if debug:
             raise
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
-        print(f"{name}: {text}", file=sys.stderr)
+        print(f"{name}: {' '.join(str(text).split())}", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         print(f"{name}: stopped; resume=FOLDER goes on where a recipe has it", file=sys.stderr)
         raise SystemExit(130) from None
+    note(settings, folder)
     result["provenance"] = provenance(settings, seconds=time.monotonic() - start)
     text = json.dumps(plain(result))
     write(folder / "result.json", text + "\n")
     print(f"RESULT {text}")
+
+
+def opened(folder: Path) -> list[Path]:
+    """Make a folder where there is none; return what was made, the innermost first.
+
+    Raises:
+        ValueError: It cannot be made.
+    """
+    try:
+        missing = [path for path in (folder, *folder.parents) if not path.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:  # ValueError: a name with NUL
+        reason = getattr(error, "strerror", None) or error
+        got = f"{str(folder)[:200]}: {reason}"
+        raise ValueError(message("out= to be a folder to write to", got)) from None
+    return missing
+
+
+def leave(made: list[Path]) -> None:
+    """Remove folders that were made for a run, where nothing was written into them."""
+    for path in made:
+        with suppress(OSError):
+            path.rmdir()
+
+
+def note(settings: Settings, folder: Path) -> None:
+    """Write the settings into the folder of a run."""
+    write(folder / "settings.json", json.dumps(dataclasses.asdict(settings)) + "\n")
 
 
 def parse(settings_type: type[S], arguments: list[str]) -> S:
@@ -83,12 +122,18 @@ def parse(settings_type: type[S], arguments: list[str]) -> S:
             raise ValueError(message("arguments of the form key=value", argument))
         if key not in fields:
             raise ValueError(message("the name of a setting", key, available=fields))
-    try:
-        given = OmegaConf.merge(OmegaConf.structured(settings_type), OmegaConf.from_cli(arguments))
-        settings: Any = OmegaConf.to_object(given)
-    except OmegaConfBaseException as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(message("values of the settings' types", reason)) from None
+    given: Any = OmegaConf.structured(settings_type)
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        try:
+            given = OmegaConf.merge(given, OmegaConf.from_cli([argument if value else f"{key}=''"]))
+            getattr(given, key)  # which resolves ${...}
+        except (OmegaConfBaseException, YAMLError) as error:
+            reason = str(error).splitlines()[0]
+            raise ValueError(message(f"a value of its type for {key}=", reason)) from None
+    settings: Any = OmegaConf.to_object(given)
+    if not 0 <= settings.seed < SEEDS:
+        raise ValueError(message(f"a seed from 0 to {SEEDS - 1}", settings.seed))
     keys = [argument.partition("=")[0] for argument in arguments]
     return resumed(settings, keys) if getattr(settings, "resume", "") else settings
 
