@@ -130,7 +130,8 @@ def parse(settings_type: type[S], arguments: list[str]) -> S:
             getattr(given, key)  # which resolves ${...}
         except (OmegaConfBaseException, YAMLError) as error:
             reason = str(error).splitlines()[0]
-            raise ValueError(message(f"a value of its type for {key}=", reason)) from None
+            got = f"{key}={value[:80]}: {reason[:200]}"
+            raise ValueError(message("values of the settings' types", got)) from None
     settings: Any = OmegaConf.to_object(given)
     if not 0 <= settings.seed < SEEDS:
         raise ValueError(message(f"a seed from 0 to {SEEDS - 1}", settings.seed))
