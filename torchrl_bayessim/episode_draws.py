@@ -1,4 +1,4 @@
-"""Draws for episodes: θ as a function of (seed, environment, episode), and of nothing else.
+"""Draws for episodes: θ as a function of (seed, entry, environment, episode), and of nothing else.
 
 However environments are spread over processes, and in whatever order they finish, episode ``e``
 of environment ``i`` gets the same θ. One call of the source serves 64 environments: the table of
@@ -13,6 +13,7 @@ __all__ = ["EpisodeDraws"]
 from collections import OrderedDict
 
 import torch
+from tensordict import NestedKey
 from torch import Tensor
 
 from .errors import message
@@ -30,6 +31,7 @@ class EpisodeDraws:
         seed: Another seed, other draws.
         pool: Restrict to this many draws, made once; each episode takes one of them at random.
             (Ramos et al. 2019 train on 100 domains.)
+        entry: What is drawn: two entries of one environment are independent.
 
     Raises:
         TypeError: ``source`` cannot be sampled.
@@ -42,14 +44,22 @@ class EpisodeDraws:
         True
     """
 
-    def __init__(self, source: Source | Grid, *, seed: int = 0, pool: int | None = None) -> None:
+    def __init__(
+        self,
+        source: Source | Grid,
+        *,
+        seed: int = 0,
+        pool: int | None = None,
+        entry: NestedKey = "theta",
+    ) -> None:
         if not isinstance(source, Grid):
             check_source(source)
         if pool is not None and (pool < 1 or isinstance(source, Grid)):
             raise ValueError(message("pool > 0 of a source that samples", pool))
+        self._key = (seed, entry if isinstance(entry, str) else repr(entry))
         if pool is not None and not isinstance(source, Grid):
-            source = Empirical(draw(source, pool, key=(seed, "pool")))
-        self.source, self.seed = source, seed
+            source = Empirical(draw(source, pool, key=(*self._key, "pool")))
+        self.source = source
         self._tables: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
 
     def __call__(self, environments: Tensor, episodes: Tensor) -> Tensor:
@@ -68,7 +78,7 @@ class EpisodeDraws:
     def _table(self, source: Source, chunk: int, episode: int) -> Tensor:
         table = self._tables.get((chunk, episode))
         if table is None:
-            key = (self.seed, "theta", chunk, episode)
+            key = (*self._key, chunk, episode)
             table = self._tables[chunk, episode] = draw(source, _ROWS, key=key)
             if len(self._tables) > _TABLES:
                 self._tables.popitem(last=False)

@@ -15,17 +15,23 @@ from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform
 
 from ..episode_draws import EpisodeDraws
 from ..errors import PhysicsError, message
+from ..randomness import seed_from
 from ..remote_source import PolicyWithSource
 from ..sources import Empirical, Grid, Source, names_of
 from .resets import resets, simulator
+from .workers import in_worker, note_seeds, noted_seed
 
 
 class DomainRandomizer(Transform):
     """Draws θ at every reset, for the environments that reset and for no others.
 
-    What episode ``e`` of environment ``i`` draws depends on ``(seed, i, e)`` alone: not on the
+    What episode ``e`` of environment ``i`` draws depends on ``(seed, key, i, e)`` alone: not on the
     process that runs it nor on when it finishes. Clones share the source and the pin, so that both
     reach an environment that TorchRL has unwrapped; give another environment its own randomizer.
+
+    It belongs around a ``SerialEnv`` or ``ParallelEnv``, where an assigned source reaches all
+    environments. Inside one, each worker has a randomizer of its own, which the worker's seed tells
+    from the others: call ``set_seed`` of the batched environment before its first reset.
 
     Args:
         source: Where to draw from: a prior, a posterior, a `Grid`, anything that samples.
@@ -33,11 +39,13 @@ class DomainRandomizer(Transform):
         names: The parameters' names; the source's own if it has some.
         seed: Another seed, other draws.
         first_environment: The global number of the first environment here. By default the
-            collector's worker number times the number of environments, or 0.
+            collector's worker number times the number of environments, or 0; give it where the
+            workers of a collector have different numbers of environments.
         pool: Restrict to this many draws, made once (the BayesSim paper's 100 domains).
 
     Raises:
-        PhysicsError: No `ApplyPhysics` before it writes ``key``, or for other parameters.
+        PhysicsError: No `ApplyPhysics` before it writes ``key``, or for other parameters; at a
+            reset, workers of a batched environment that nothing tells apart.
         TypeError: The source, now or when assigned, cannot be sampled.
 
     Example:
@@ -86,7 +94,7 @@ class DomainRandomizer(Transform):
         names, known = names_of(source), self._shared["names"]
         if None not in (names, known) and names != known:
             raise ValueError(message(f"a source over {known}", names))
-        draws = EpisodeDraws(source, seed=self._shared["seed"], pool=self.pool)
+        draws = EpisodeDraws(source, seed=self._shared["seed"], pool=self.pool, entry=self.key)
         self._shared |= {"source": source, "draws": draws, "names": known or names}
 
     @property
@@ -153,6 +161,7 @@ class DomainRandomizer(Transform):
             raise PhysicsError(
                 message(f"{spec.shape[-1]} parameters, as ApplyPhysics has", self.names)
             )
+        note_seeds(simulator(self.parent))
         self._check_names()
 
     def _check_names(self) -> None:
@@ -200,15 +209,28 @@ class DomainRandomizer(Transform):
                 )
             return pinned.expand(shape).reshape(-1, shape[-1])[rows]
         self._receive()
-        first = self.first_environment
-        if first is None:
-            collector = self.collector
-            worker = None if collector is None else collector.worker_idx
-            first = (worker or 0) * len(self._theta)
-        theta = self._shared["draws"](first + rows, self._episodes[rows])
+        theta = self._shared["draws"](self._first() + rows, self._episodes[rows])
         if theta.shape[-1] != shape[-1]:
             raise ValueError(message(f"a source of {shape[-1]} parameters", theta.shape[-1]))
         return theta
+
+    def _first(self) -> int:
+        """Return the global number of the first environment here."""
+        if self.first_environment is not None:
+            return self.first_environment
+        collector = self.collector
+        if collector is not None or not in_worker():
+            worker = None if collector is None else collector.worker_idx
+            return (worker or 0) * len(self._theta)
+        seed = noted_seed(simulator(self.parent))
+        if seed is None or isinstance(self.source, Grid):
+            expected = "what tells the workers of a batched environment apart"
+            got = "a Grid, which goes by their numbers" if seed is not None else "no seed yet"
+            outside = "TransformedEnv(SerialEnv(n, make), DomainRandomizer(source))"
+            hint = f"the randomizer outside, {outside}, or "
+            hint += "first_environment=" if seed is not None else "env.set_seed(0) before the reset"
+            raise PhysicsError(message(expected, got, hint=hint))
+        return seed_from(seed, "worker") % 2**48
 
     def _receive(self) -> None:
         """Take over a table that `push_source` has sent since the last reset."""
