@@ -132,6 +132,31 @@ def test_the_policy_acts_as_before_and_its_table_is_saved_with_it():
     assert "draws" in policy.state_dict()
 
 
+def test_the_later_of_a_push_and_an_assignment_holds():
+    env = make()
+    made = Collector(
+        env,
+        carrying(),
+        frames_per_batch=4,
+        total_frames=40,
+        reset_at_each_iter=True,
+        auto_register_policy_transforms=False,
+    )
+    batches = iter(made)
+
+    def low():
+        return float(next(batches)["theta"].min())
+
+    assert low() < 0.3
+    push_source(made, Around(1.2), key=(0,))
+    assert low() > 1.2
+    env.transform.source = Around(0.2)
+    assert low() < 0.3
+    push_source(made, Around(1.2), key=(0,))  # the very same table
+    assert low() > 1.2
+    made.shutdown()
+
+
 def test_push_needs_a_carrier_and_the_same_parameters():
     policy = TensorDictModule(Bang(), in_keys=["observation"], out_keys=["action"])
     without = collector(Collector, policy)

@@ -31,7 +31,8 @@ class PolicyWithSource(TensorDictModuleWrapper):
     """A policy that also carries draws of the parameters to the collector's workers.
 
     It acts as ``policy`` does. Until the first `push_source` the table is NaN, and environments
-    keep the source that they were built with.
+    keep the source that they were built with. Each push takes effect, also of the same table: the
+    later of an assignment to a randomizer and of a push holds.
 
     Args:
         policy: The policy.
@@ -40,12 +41,14 @@ class PolicyWithSource(TensorDictModuleWrapper):
     """
 
     draws: Tensor
+    pushes: Tensor
 
     def __init__(self, policy: TensorDictModuleBase, source: Source, *, draws: int = 4096) -> None:
         super().__init__(policy)
         dim = draw(source, 1, key=("dimension",)).shape[1]
         self.names = names_of(source)
-        self.register_buffer("draws", torch.full((draws, dim), torch.nan))
+        self.register_buffer("draws", torch.full((draws, dim), torch.nan, dtype=torch.float32))
+        self.register_buffer("pushes", torch.zeros((), dtype=torch.int64))
 
     @staticmethod
     def inside(policy: Any) -> PolicyWithSource | None:
@@ -85,4 +88,5 @@ def push_source(collector: BaseCollector, source: Source, *, key: tuple[int | st
     if table.shape != carrier.draws.shape:
         raise ValueError(message(f"draws of shape {(*carrier.draws.shape,)}", (*table.shape,)))
     carrier.draws.copy_(table)
+    carrier.pushes.add_(1)
     collector.update_policy_weights_(TensorDict.from_module(policy).data)

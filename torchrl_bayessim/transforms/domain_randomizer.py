@@ -81,7 +81,7 @@ class DomainRandomizer(Transform):
         self._episodes = torch.zeros(0, dtype=torch.int64)  # begun so far, per environment
         self._theta = torch.zeros(0, 0)  # of the running episodes
         self._checked = False
-        self._pushed: Tensor | None = None
+        self._pushed: tuple[int, Tensor] | None = None
         self._clone_of: ref[BaseCollector] | None = None
 
     @property
@@ -237,11 +237,13 @@ class DomainRandomizer(Transform):
         carrier = PolicyWithSource.inside(getattr(self.collector, "policy", None))
         if carrier is None:
             return
-        draws = carrier.draws.detach().cpu()
-        unchanged = self._pushed is not None and torch.equal(draws, self._pushed)
+        # the count tells a table that is pushed again; the table, one that was still on its way
+        count, draws = int(carrier.pushes), carrier.draws.detach().cpu()
+        known = self._pushed
+        unchanged = known is not None and known[0] == count and torch.equal(draws, known[1])
         if draws.isfinite().all() and not unchanged:
-            self._pushed = draws.clone()
-            self.source = Empirical(self._pushed, names=carrier.names)
+            self._pushed = (count, draws.clone())
+            self.source = Empirical(draws.clone(), names=carrier.names)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
