@@ -96,3 +96,14 @@ def test_two_entries_of_an_environment_are_drawn_independently():
 
 PRIOR_OF_LENGTH = BoxPrior({"length": (0.1, 2.0)})
 PRIOR_OF_MASS = BoxPrior({"masspole": (0.1, 2.0)})
+
+
+def test_float64_as_the_default_does_not_change_the_draws():
+    expected = inside().reset()["theta"]
+    torch.set_default_dtype(torch.float64)
+    try:
+        theta = inside().reset()["theta"]
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert theta.dtype == torch.float32
+    torch.testing.assert_close(theta, expected, rtol=1e-6, atol=0)

@@ -190,7 +190,8 @@ class BoxPrior(Prior):
         self, sample_shape: Sequence[int] = (), *, generator: torch.Generator | None = None
     ) -> Tensor:
         """Return draws of shape ``(*sample_shape, D)``, from ``generator`` if one is given."""
-        unit = torch.rand(*sample_shape, *self.event_shape, generator=generator)
+        shape = (*sample_shape, *self.event_shape)
+        unit = torch.rand(shape, generator=generator, dtype=self.low.dtype)
         low, high = self._u(self.low), self._u(self.high)
         u = low + unit * (high - low)
         theta = torch.where(self.log, u.exp(), u)

@@ -188,7 +188,7 @@ class DomainRandomizer(Transform):
         batch = tensordict.batch_size
         shape = (*batch, parent.full_state_spec[self.key].shape[-1])
         if len(self._theta) != batch.numel():
-            self._theta = torch.zeros(batch.numel(), shape[-1])
+            self._theta = torch.zeros(batch.numel(), shape[-1], dtype=torch.float32)
         if len(self._episodes) < batch.numel():
             more = torch.zeros(batch.numel() - len(self._episodes), dtype=torch.int64)
             self._episodes = torch.cat([self._episodes, more])
