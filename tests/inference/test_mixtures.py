@@ -114,12 +114,14 @@ def test_batches_of_products_are_products_of_each():
 
 def test_division_by_a_gaussian_is_that_of_quadrature():
     mixture = line_mixture([0.6, 0.3, 0.1], [-1.0, 0.5, 2.0], [0.3, 0.6, 0.9])
-    quotient, repaired = divide(mixture, tensor(0.7), tensor(1.3**2)[None])
+    quotient, repaired = divide(
+        mixture, tensor(0.7), tensor(1.3**2)[None], widest=tensor(100.0)[None]
+    )
     divisor = line_mixture([1.0], [0.7], [1.3])
     expected = normalised(log_prob(mixture, LINE[:, None]) - log_prob(divisor, LINE[:, None]))
     got = log_prob(quotient, LINE[:, None]).exp()
     torch.testing.assert_close(got, expected, rtol=1e-8, atol=1e-10)
-    assert repaired == 0
+    assert not repaired.any()
 
 
 @given(seed=SEEDS, dim=st.integers(1, 3))
@@ -128,50 +130,67 @@ def test_division_undoes_multiplication(seed, dim):
     mixture = random_mixture(seed, dim=dim)
     divisor = random_mixture(seed + 1, components=1, dim=dim)
     quotient, repaired = divide(
-        multiply(mixture, divisor), divisor.loc[0], divisor.covariance[0], max_variance=1e6
+        multiply(mixture, divisor),
+        divisor.loc[0],
+        divisor.covariance[0],
+        widest=1e6 * torch.eye(dim, dtype=torch.float64),
     )
     points = torch.randn(6, dim, generator=generator(seed), dtype=torch.float64)
     torch.testing.assert_close(
         log_prob(quotient, points), log_prob(mixture, points), rtol=1e-4, atol=1e-4
     )
-    assert repaired == 0
+    assert not repaired.any()
 
 
-def test_a_component_wider_than_the_divisor_is_repaired_and_counted():
+WIDEST = tensor(4.0)[None]
+
+
+def test_a_component_wider_than_the_divisor_is_repaired():
     mixture = line_mixture([0.4, 0.4, 0.2], [0.0, 1.0, 3.0], [0.2, 1.0, 2.0])
-    quotient, repaired = divide(mixture, tensor(0.0), tensor(1.0)[None])
-    assert repaired == 2  # as wide as the divisor, and wider
-    assert (quotient.covariance > 0).all()
+    quotient, repaired = divide(mixture, tensor(0.0), tensor(1.0)[None], widest=WIDEST)
+    assert repaired.tolist() == [False, True, True]  # as wide as the divisor, and wider
     torch.testing.assert_close(quotient.loc[1:, 0], tensor(1.0, 3.0))
-    torch.testing.assert_close(quotient.covariance[1:].flatten(), tensor(100.0, 100.0))
+    torch.testing.assert_close(quotient.covariance[1:].flatten(), tensor(4.0, 4.0))
 
 
 def test_only_the_wide_directions_of_a_component_are_repaired():
     scale = torch.diag(tensor(0.5, 2.0))[None]
     mixture = Mixture(tensor(0.0), tensor(1.0, 1.0)[None], scale)
-    quotient, repaired = divide(mixture, tensor(0.0, 0.0), torch.eye(2, dtype=torch.float64))
-    assert repaired == 1
-    torch.testing.assert_close(quotient.covariance[0], torch.diag(tensor(1 / 3, 100.0)))
+    unit = torch.eye(2, dtype=torch.float64)
+    quotient, repaired = divide(mixture, tensor(0.0, 0.0), unit, widest=9 * unit)
+    assert repaired.tolist() == [True]
+    torch.testing.assert_close(quotient.covariance[0], torch.diag(tensor(1 / 3, 9.0)))
     torch.testing.assert_close(quotient.loc[0], tensor(4 / 3, 1.0))
+
+
+@given(seed=SEEDS, dim=st.integers(1, 3))
+@settings(max_examples=30, deadline=None)
+def test_no_quotient_is_wider_than_allowed(seed, dim):
+    mixture = random_mixture(seed, dim=dim)
+    divisor = random_mixture(seed + 1, components=1, dim=dim)
+    widest = random_mixture(seed + 2, components=1, dim=dim).covariance[0]
+    quotient, _ = divide(mixture, divisor.loc[0], divisor.covariance[0], widest=widest)
+    left = torch.linalg.eigvalsh(widest - quotient.covariance)
+    assert (left >= -1e-9 * widest.diagonal().sum()).all()
 
 
 @pytest.mark.parametrize("wide", [1.1, 2.0, 4.0])
 def test_a_negligible_wide_component_does_not_take_over(wide):
     mixture = line_mixture([0.999, 0.001], [0.0, 3.0], [0.1, wide])
-    quotient, repaired = divide(mixture, tensor(0.0), tensor(1.0)[None])
-    assert repaired == 1
-    # the quotient is exact at the component's mean: 0.001 N(3; 3, wide^2) / N(3; 0, 1)
-    height = 0.001 / wide * math.exp(4.5)
+    quotient, repaired = divide(mixture, tensor(0.0), tensor(1.0)[None], widest=WIDEST)
+    assert repaired.tolist() == [False, True]
+    # its mass times 1 / N(3; 0, 1), less where the repair narrows it to a deviation of 2
+    mass = 0.001 * min(1.0, 2.0 / wide) * math.exp(4.5)
     near = 0.999 * math.sqrt(1 / (1 - 0.01))
-    share = 10 * height / (10 * height + near)
-    assert quotient.logits.softmax(-1)[1].item() == pytest.approx(share)
+    assert quotient.logits.softmax(-1)[1].item() == pytest.approx(mass / (mass + near))
 
 
-def test_repairs_are_counted_over_a_batch():
+def test_repairs_are_told_over_a_batch():
     loc = torch.zeros(3, 2, 1, dtype=torch.float64)
     scale = tensor(0.5, 0.5, 0.5, 2.0, 2.0, 2.0).reshape(3, 2, 1, 1)
     mixture = Mixture(torch.zeros(3, 2, dtype=torch.float64), loc, scale)
-    assert divide(mixture, tensor(0.0), tensor(1.0)[None]).repaired == 3
+    repaired = divide(mixture, tensor(0.0), tensor(1.0)[None], widest=WIDEST).repaired
+    assert repaired.tolist() == [[False, False], [False, True], [True, True]]
 
 
 def test_dividing_by_a_mixture_term_by_term_is_wrong():
@@ -186,11 +205,11 @@ def test_dividing_by_a_mixture_term_by_term_is_wrong():
     mean = (exact * LINE).sum() * STEP
     assert mean.item() == pytest.approx(0.311, abs=0.01)
 
-    each = divide(mixture, proposal.loc, proposal.covariance)
+    each = divide(mixture, proposal.loc, proposal.covariance, widest=100 * WIDEST)
     # two divisors are two problems, each with its own exact answer, never summed
     assert each.mixture.logits.shape == (2, 1)
     for got, loc, scale in zip(each.mixture.loc, proposal.loc, proposal.scale_tril, strict=True):
-        one = divide(mixture, loc, scale @ scale.mT)
+        one = divide(mixture, loc, scale @ scale.mT, widest=100 * WIDEST)
         torch.testing.assert_close(got, one.mixture.loc)
 
     # sum_l (1 / gamma_l) N / N_l, whose terms have these masses

@@ -234,13 +234,13 @@ def test_the_division_is_exact_for_a_linear_gaussian_problem(prior):
         exact = linear_gaussian(prior.mean.double(), tril @ tril.mT, x)
     else:
         exact = linear_gaussian(proposal_mean, 1e12 * proposal_covariance, x)
-    corrected, repaired = analytic_correction(
+    corrected, repaired, dropped, _ = analytic_correction(
         mixture(prior, *[[moment.tolist() for moment in learned]]), proposal
     )
     theta = exact[0] + torch.randn(200, 2, dtype=torch.float64) @ torch.linalg.cholesky(exact[1]).mT
     expected = torch.distributions.MultivariateNormal(*exact).log_prob(theta)
     torch.testing.assert_close(corrected.log_prob(theta).double(), expected, rtol=0, atol=2e-3)
-    assert repaired == 0
+    assert repaired == dropped == 0
 
 
 @pytest.mark.parametrize("prior", [BOX, NORMAL], ids=["box", "normal"])
@@ -250,36 +250,74 @@ def test_the_division_of_a_mixture_is_the_ratio_of_densities(prior):
         prior, ([-1.8], [[0.09]]), ([0.2], [[0.01]]), ([1.6], [[0.25]]), weights=[0.5, 0.2, 0.3]
     )
     proposal = mixture(prior, ([0.4], [[1.3]]))
-    corrected, repaired = analytic_correction(learned, proposal)
+    corrected, repaired, dropped, _ = analytic_correction(learned, proposal)
     theta, step = midpoints(-2.0, 2.0) if prior is BOX else midpoints(-6.0, 6.0)
     ratio = learned.log_prob(theta) + prior.log_prob(theta) - proposal.log_prob(theta)
     expected = ratio.double().softmax(0) / step
     found = corrected.log_prob(theta).double().exp()
     assert 0.5 * (found - expected).abs().sum().item() * step < 1e-3
-    assert repaired == 0
+    assert repaired == dropped == 0
 
 
 def test_the_prior_s_own_precision_counts_before_anything_is_repaired():
-    """The learned component is a little wider than the proposal, the product with p is not."""
-    learned, proposal = mixture(NORMAL, ([0.6], [[1.1]])), mixture(NORMAL, ([0.4], [[1.0]]))
-    corrected, repaired = analytic_correction(learned, proposal)
-    assert repaired == 0
-    precision = 1 / 1.1 - 1 / 1.0 + 1 / 4.0
-    mean = (0.6 / 1.1 - 0.4 / 1.0 + 0.5 / 4.0) / precision
+    """The quotient alone would be wider than the prior, the product with p is not."""
+    learned, proposal = mixture(NORMAL, ([0.5], [[0.95]])), mixture(NORMAL, ([0.4], [[1.0]]))
+    corrected, repaired, dropped, _ = analytic_correction(learned, proposal)
+    assert repaired == dropped == 0
+    precision = 1 / 0.95 - 1 / 1.0 + 1 / 4.0
+    mean = (0.5 / 0.95 - 0.4 / 1.0 + 0.5 / 4.0) / precision
     assert corrected.mean.item() == pytest.approx(mean, abs=0.02)
     assert corrected.variance.item() == pytest.approx(1 / precision, rel=0.02)
 
 
-def test_components_wider_than_the_proposal_are_repaired_counted_and_said():
-    learned = mixture(BOX, ([0.5], [[0.01]]), ([0.0], [[1.0]]), weights=[0.99, 0.01])
-    proposal = mixture(BOX, ([0.5], [[0.2]]))
-    with pytest.warns(UserWarning, match="1 components were wider than the proposal"):
-        corrected, repaired = analytic_correction(learned, proposal)
-    assert repaired == 1
-    theta, step = midpoints(-2.0, 2.0)
-    density = corrected.log_prob(theta).double().exp()
-    assert (density.sum() * step).item() == pytest.approx(1, abs=1e-3)
-    assert corrected.mean.item() == pytest.approx(0.5, abs=0.1)
+STANDARD = GaussianPrior({"a": (0.0, 1.0)})
+
+
+@pytest.mark.parametrize("wide", [0.149, 0.1499, 0.16, 0.3, 1.0])
+@pytest.mark.parametrize("weight", [1e-6, 1e-3, 0.05])
+def test_a_component_wider_than_the_proposal_does_not_ruin_the_quotient(weight, wide):
+    components = [([0.2], [[0.01]]), ([0.3], [[wide**2]])]
+    learned = mixture(STANDARD, *components, weights=[1 - weight, weight])
+    proposal = mixture(STANDARD, ([0.25], [[0.15**2]]))
+    with pytest.warns(UserWarning, match="components with a quotient wider than the prior"):
+        corrected, repaired, dropped, doubtful = analytic_correction(learned, proposal)
+    assert repaired + dropped == 1
+    assert doubtful == pytest.approx(weight, rel=1e-4)
+    precision = 100 - 1 / 0.15**2 + 1  # of the component that can be divided
+    mean = (0.2 * 100 - 0.25 / 0.15**2) / precision
+    assert corrected.mean.item() == pytest.approx(mean, abs=0.03)
+    assert corrected.stddev.item() == pytest.approx(precision**-0.5, rel=0.25)
+
+
+@pytest.mark.parametrize("prior", [BOX, NORMAL], ids=["box", "normal"])
+def test_a_quotient_of_several_components_is_nowhere_wider_than_the_prior(prior):
+    learned = mixture(
+        prior, ([0.5], [[0.2]]), ([0.2], [[0.79]]), ([0.9], [[0.9]]), weights=[0.8, 0.1, 0.1]
+    )
+    proposal = mixture(prior, ([0.5], [[0.8]]))
+    with pytest.warns(UserWarning, match="quotient wider than the prior"):
+        corrected = analytic_correction(learned, proposal).posterior
+    assert corrected.stddev.item() < prior.variance.sqrt().item()
+    if prior is BOX:
+        assert (corrected.mixture.scale_tril <= 4.0 + 1e-6).all()  # nearly flat over the box
+    else:
+        assert (corrected.mixture.scale_tril <= 1.0 + 1e-6).all()
+
+
+def test_a_quotient_outside_the_proposal_is_dropped():
+    learned = mixture(STANDARD, ([0.2], [[0.0025]]), ([0.5], [[0.009]]), weights=[0.9, 0.1])
+    proposal = mixture(STANDARD, ([0.2], [[0.01]]))  # the second's quotient would lie at 2.5
+    with pytest.warns(UserWarning, match="1 with one outside the proposal dropped: 10.0%"):
+        corrected, repaired, dropped, _ = analytic_correction(learned, proposal)
+    assert (repaired, dropped) == (0, 1)
+    assert corrected.mixture.logits.numel() == 1
+
+
+def test_a_learned_posterior_that_is_as_wide_as_the_proposal_is_refused():
+    learned = mixture(STANDARD, ([0.2], [[0.0025]]), ([0.2], [[0.012]]), weights=[0.4, 0.6])
+    proposal = mixture(STANDARD, ([0.2], [[0.01]]))
+    with pytest.raises(SimulationError, match=r"narrower than the proposal.*60%.*Try: more sim"):
+        analytic_correction(learned, proposal)
 
 
 def test_a_mixture_is_refused_as_divisor():

@@ -3,6 +3,7 @@ import itertools
 import pytest
 import torch
 
+from torchrl_bayessim.errors import SimulationError
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
 from torchrl_bayessim.inference.sequential import sequential
@@ -67,6 +68,46 @@ def test_a_linear_gaussian_problem_has_its_known_posterior(correction):
     mean = (1.0 / 2.0**2 + 2.0 / 0.5**2) / precision
     assert last.posterior.mean.item() == pytest.approx(mean, abs=0.1)
     assert last.posterior.stddev.item() == pytest.approx(precision**-0.5, rel=0.12)
+
+
+@pytest.mark.filterwarnings("ignore:.*quotient wider than the prior")
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_analytic_correction_stays_at_the_known_posterior_round_after_round(seed):
+    """theta ~ N(0, 1), x = theta + N(0, 0.1^2), observed x = 0.3, mixtures of four components."""
+    noise = generator("sharp", seed)
+    rounds = sequential(
+        lambda theta: theta + 0.1 * torch.randn(theta.shape, generator=noise),
+        GaussianPrior({"theta": (0.0, 1.0)}),
+        torch.tensor([[0.3]]),
+        rounds=3,
+        simulations=300,
+        correction="analytic",
+        seed=seed,
+        epochs=40,
+        progress=False,
+    )
+    for each in rounds:
+        assert each.posterior.mean.item() == pytest.approx(0.297, abs=0.07)
+        assert each.posterior.stddev.item() == pytest.approx(0.0995, rel=0.35)
+        assert not each.refused
+
+
+def test_a_refused_division_keeps_the_posterior_before_and_the_pairs(monkeypatch):
+    divisions = []
+
+    def refuse(learned, proposal):
+        divisions.append(proposal)
+        raise SimulationError("no division.")
+
+    monkeypatch.setattr("torchrl_bayessim.inference.sequential.analytic_correction", refuse)
+    rounds = sequential(
+        square(0), BOX, OBSERVED, rounds=3, simulations=100, correction="analytic", **QUICK
+    )
+    with pytest.warns(UserWarning, match="no division. The posterior of the round before stays"):
+        first, second, third = rounds
+    assert first.posterior is second.posterior is third.posterior
+    assert divisions[0] is divisions[1]
+    assert (second.refused, second.fit.pairs, third.fit.pairs) == (True, 100, 200)
 
 
 @every_correction

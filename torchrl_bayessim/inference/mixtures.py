@@ -47,11 +47,11 @@ class Division(NamedTuple):
 
     Attributes:
         mixture: The quotient.
-        repaired: How many components had an indefinite precision that was repaired.
+        repaired: Which components would have been wider than allowed, boolean, shape ``(*, K)``.
     """
 
     mixture: Mixture
-    repaired: int
+    repaired: Tensor
 
 
 def component_log_prob(value: Tensor, loc: Tensor, scale_tril: Tensor) -> Tensor:
@@ -114,9 +114,7 @@ def multiply(first: Mixture, second: Mixture) -> Mixture:
     return Mixture(logits.flatten(-2), loc.flatten(-3, -2), scale.flatten(-4, -3))
 
 
-def divide(
-    mixture: Mixture, mean: Tensor, covariance: Tensor, *, max_variance: float = 1e2
-) -> Division:
+def divide(mixture: Mixture, mean: Tensor, covariance: Tensor, *, widest: Tensor) -> Division:
     r"""Divide a mixture by one Gaussian :math:`N(\mu_0, \Sigma_0)` (Papamakarios & Murray, 2016).
 
     .. math::
@@ -127,41 +125,50 @@ def divide(
 
     at any :math:`\theta`, here at :math:`\mu_k` (arXiv:1605.06376, appendix C; the BayesSim paper
     prints :math:`\Sigma_k^{-1}` for :math:`\Sigma'_k` in the mean, a misprint). The precision is
-    indefinite wherever a component is wider than the divisor: there its eigenvalues are raised to
-    ``1 / max_variance``, its mean stays where it was, and the component is counted as repaired. A
-    *mixture* divisor has no such formula; dividing by it component by component is wrong.
+    indefinite wherever a component is wider than the divisor. A component that would be wider than
+    ``widest`` in some direction gets that width there, its mean stays where it was, and it keeps
+    its mass times the ratio at its mean: a wide component of the same height would have as much
+    more mass as it is wider, and take over. A *mixture* divisor has no such formula; dividing by it
+    component by component is wrong.
 
     Args:
         mixture: The dividend, in standardised coordinates.
         mean: :math:`\mu_0`, shape ``(*, D)``.
         covariance: :math:`\Sigma_0`, shape ``(*, D, D)``.
-        max_variance: Largest variance that a repaired direction may have.
+        widest: The covariance :math:`B` that no component may exceed, shape ``(D, D)``: every
+            :math:`B - \Sigma'_k` is positive semidefinite.
 
     Example:
         >>> wide = Mixture(torch.zeros(1), torch.zeros(1, 1), 2 * torch.ones(1, 1, 1))
-        >>> quotient = divide(wide, torch.ones(1), 8 * torch.ones(1, 1))
-        >>> quotient.mixture.loc.item(), quotient.repaired
-        (-1.0, 0)
+        >>> quotient = divide(wide, torch.ones(1), 8 * torch.ones(1, 1), widest=9 * torch.eye(1))
+        >>> quotient.mixture.loc.item(), quotient.repaired.item()
+        (-1.0, False)
         >>> round(quotient.mixture.covariance.item(), 4)
         8.0
     """
     precision = torch.cholesky_inverse(mixture.scale_tril)
     precision_0 = torch.linalg.inv(covariance).unsqueeze(-3)
     shift = precision @ mixture.loc.unsqueeze(-1) - precision_0 @ mean[..., None, :, None]
-    values, vectors = torch.linalg.eigh(_symmetric(precision - precision_0))
-    bad = values < 1 / max_variance
-    values = torch.where(bad, 1 / max_variance, values)
+    # in coordinates where the widest covariance is the identity
+    unit = torch.linalg.cholesky(widest)
+    values, vectors = torch.linalg.eigh(_symmetric(unit.mT @ (precision - precision_0) @ unit))
+    bad = values < 1 - 1e-9
+    values = values.clamp_min(1.0)
     # a mean far away, and with it an enormous weight, would be read off a badly known difference
-    stay = vectors.mT @ mixture.loc.unsqueeze(-1)
-    solved = (vectors.mT @ shift) / values.unsqueeze(-1)
-    loc = (vectors @ torch.where(bad.unsqueeze(-1), stay, solved)).squeeze(-1)
-    scale = torch.linalg.cholesky(_symmetric(vectors @ (vectors / values.unsqueeze(-2)).mT))
+    back = unit @ vectors
+    stay = torch.linalg.solve(back, mixture.loc.unsqueeze(-1))
+    solved = (back.mT @ shift) / values.unsqueeze(-1)
+    loc = (back @ torch.where(bad.unsqueeze(-1), stay, solved)).squeeze(-1)
+    scale = torch.linalg.cholesky(_symmetric(back @ (back / values.unsqueeze(-2)).mT))
     own = -mixture.scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    own = own - 0.5 * mixture.loc.shape[-1] * math.log(2 * math.pi)
     scale_0 = torch.linalg.cholesky(covariance)[..., None, None, :, :]
     divisor = component_log_prob(mixture.loc, mean[..., None, None, :], scale_0).squeeze(-1)
     raised = component_log_prob(mixture.loc, loc.unsqueeze(-2), scale.unsqueeze(-3)).squeeze(-1)
-    logits = (mixture.logits + own - divisor - raised).log_softmax(-1)
-    return Division(Mixture(logits, loc, scale), int(bad.any(-1).sum()))
+    repaired = bad.any(-1)
+    widening = torch.where(repaired, (own - raised).clamp(max=0.0), own - raised)
+    logits = (mixture.logits - divisor + widening).log_softmax(-1)
+    return Division(Mixture(logits, loc, scale), repaired)
 
 
 def reduce(mixture: Mixture, components: int) -> Mixture:

@@ -46,6 +46,6 @@ def pool(each: TruncatedGaussianMixture, *, bounded: bool) -> TruncatedGaussianM
         if not bounded:
             # no component of a posterior is wider than the prior
             zero = torch.zeros_like(identity[0])
-            product = divide(product, zero, identity, max_variance=1.0).mixture
+            product = divide(product, zero, identity, widest=identity).mixture
         product = reduce(product, MAX_COMPONENTS)
     return TruncatedGaussianMixture.restrict(*product, each.box, diagonal=False)

@@ -9,12 +9,14 @@ Pairs drawn from a proposal :math:`\tilde p(\theta)` instead of the prior would 
 * ``"truncated"``: the prior restricted to the posterior's highest-density region, so that weights
   are constant within every region (Deistler et al., 2022, arXiv:2210.04815).
 * ``"analytic"``: the BayesSim paper's division of the learned mixture by a Gaussian proposal
-  (arXiv:1906.01728, eq. 14). Only for one Gaussian: see :func:`.mixtures.divide`.
+  (arXiv:1906.01728, eq. 14). Only for one Gaussian, and guarded: see
+  :func:`analytic_correction`.
 """
 
 from __future__ import annotations
 
 __all__ = [
+    "AnalyticCorrection",
     "HighestDensityPrior",
     "analytic_correction",
     "effective_sample_size",
@@ -26,14 +28,16 @@ __all__ = [
 import math
 import warnings
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
+from scipy.stats import chi2
 from torch import Tensor
 
 from ..errors import SimulationError, message
 from ..sources import draw
 from .mixtures import Mixture, divide, multiply
+from .network import WIDEST
 from .physics_posterior import PhysicsPosterior
 from .priors import BoxPrior, Prior
 from .truncation import TruncatedGaussianMixture
@@ -214,10 +218,33 @@ def gaussian_proposal(posterior: PhysicsPosterior, *, inflate: float = 1.5) -> P
     return PhysicsPosterior(one, posterior.prior)
 
 
+class AnalyticCorrection(NamedTuple):
+    """What the division by the proposal gave.
+
+    Attributes:
+        posterior: The corrected one.
+        repaired: Components that would have been wider than the prior, or than twice the proposal
+            where that is narrower: narrowed to that.
+        dropped: Components whose quotient lies where the proposal has no draws.
+        doubtful: The probability of both kinds under the learned posterior, between 0 and 1.
+    """
+
+    posterior: PhysicsPosterior
+    repaired: int
+    dropped: int
+    doubtful: float
+
+
 def analytic_correction(
     learned: PhysicsPosterior, proposal: PhysicsPosterior
-) -> tuple[PhysicsPosterior, int]:
-    r"""Return :math:`\propto q(\theta \mid x)\, p(\theta) / \tilde p(\theta)` and the repairs.
+) -> AnalyticCorrection:
+    r"""Return :math:`\propto q(\theta \mid x)\, p(\theta) / \tilde p(\theta)`, and the repairs.
+
+    The division extrapolates: a component nearly as wide as the proposal has a quotient that is
+    wider than anything simulated, or far away from it, with an enormous weight. So no component
+    of the result is wider than the prior, nor than twice the proposal where the prior is wider
+    still (see :func:`.mixtures.divide`); and those whose mean lies outside the region that holds
+    99 % of the proposal's draws are dropped.
 
     Args:
         learned: What the network gives when trained on draws of the proposal, unweighted.
@@ -226,6 +253,7 @@ def analytic_correction(
     Raises:
         ValueError: If the proposal has more than one component: dividing by a mixture term by term
             is wrong.
+        SimulationError: If most of the learned posterior would have to be repaired or dropped.
     """
     mixture, divisor = learned.mixture, proposal.mixture
     if divisor.logits.numel() != 1:
@@ -237,17 +265,48 @@ def analytic_correction(
             )
         )
     dividend = Mixture(mixture.untruncated_logits, mixture.loc, mixture.scale_tril)
-    if learned.prior.box is None:  # the prior is N(0, I) here, not a constant
+    bounded = learned.prior.box is not None
+    if not bounded:  # the prior is N(0, I) here, not a constant
         # before the division: a precision may need the prior's to stay positive
         identity = torch.eye(divisor.loc.shape[-1], dtype=divisor.loc.dtype)
         dividend = _times_standard_normal(dividend, identity)
-    covariance = divisor.scale_tril[0] @ divisor.scale_tril[0].mT
-    quotient, repaired = divide(dividend, divisor.loc[0], covariance)
-    if repaired:
-        text = f"{repaired} components were wider than the proposal and had to be repaired"
+    mean, covariance = divisor.loc[0], divisor.scale_tril[0] @ divisor.scale_tril[0].mT
+    widest = _widest(covariance, of_prior=WIDEST**2 if bounded else 1.0)
+    quotient, repaired = divide(dividend, mean, covariance, widest=widest)
+    supported = _supported(quotient.loc, mean, divisor.scale_tril[0])
+    doubtful = mixture.logits.exp()[repaired | ~supported].sum().item()
+    if doubtful > 0.5:
+        raise SimulationError(
+            message(
+                "a learned posterior that is narrower than the proposal, and inside it",
+                f"{doubtful:.0%} of it that is not: a division would be extrapolation",
+                hint='more simulations, or correction="importance"',
+            )
+        )
+    repaired = repaired & supported
+    found = (int(repaired.sum()), int((~supported).sum()))
+    if any(found):
+        text = (
+            f"{found[0]} components with a quotient wider than the prior or twice the proposal "
+            f"were narrowed, {found[1]} with one outside the proposal dropped: {doubtful:.1%} of "
+            "the learned posterior"
+        )
         warnings.warn(text, stacklevel=2)
-    corrected = TruncatedGaussianMixture.restrict(*quotient, learned.prior.box)
-    return PhysicsPosterior(corrected, learned.prior), repaired
+    parts = Mixture(*(part[supported] for part in quotient))
+    corrected = TruncatedGaussianMixture.restrict(*parts, learned.prior.box)
+    return AnalyticCorrection(PhysicsPosterior(corrected, learned.prior), *found, doubtful)
+
+
+def _widest(covariance: Tensor, *, of_prior: float) -> Tensor:
+    """Return the proposal's covariance with twice its deviations, at most the prior's variance."""
+    values, vectors = torch.linalg.eigh(covariance)
+    return vectors @ torch.diag((4 * values).clamp(max=of_prior)) @ vectors.mT
+
+
+def _supported(loc: Tensor, mean: Tensor, scale_tril: Tensor) -> Tensor:
+    """Return which points ``(K, D)`` lie in the ellipsoid of 99 % of a Gaussian's draws."""
+    noise = torch.linalg.solve_triangular(scale_tril, (loc - mean).mT, upper=False)
+    return noise.square().sum(0) <= chi2.ppf(0.99, len(mean))
 
 
 def _times_standard_normal(mixture: Mixture, identity: Tensor) -> Mixture:

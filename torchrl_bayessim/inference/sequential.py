@@ -17,7 +17,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from ..errors import message
+from ..errors import SimulationError, message
 from ..randomness import seed_from
 from ..sources import Defensive, draw
 from .ensemble import learn, pairs_of
@@ -47,7 +47,9 @@ class SequentialRound:
         posterior: Given the observed summaries.
         fit: What the fit did.
         effective_pairs: Effective number of pairs after weighting.
-        repaired: Components repaired by the analytic correction.
+        repaired: Components narrowed or dropped by the analytic correction.
+        refused: Whether the analytic correction was refused; ``posterior`` is the last round's
+            then, and its pairs are kept for the next.
     """
 
     index: int
@@ -55,6 +57,7 @@ class SequentialRound:
     fit: FitReport
     effective_pairs: float
     repaired: int = 0
+    refused: bool = False
 
 
 def sequential(
@@ -80,7 +83,8 @@ def sequential(
         rounds: Number of rounds.
         simulations: Simulations per round.
         correction: See :mod:`.proposals`. ``"importance"`` and ``"truncated"`` train on the pairs
-            of all rounds; ``"analytic"`` on the last round's.
+            of all rounds; ``"analytic"`` on the last round's, and if it has to refuse a
+            division, warns and goes on with the posterior before.
         prior_share: Share of the draws from the prior that is kept in every proposal.
         networks: Networks fitted each round, on other splits of the pairs; the posterior is their
             average, which is less sure where they disagree.
@@ -106,14 +110,15 @@ def sequential(
             message("a correction", correction, available=["importance", "truncated", "analytic"])
         )
     proposal: Any = prior
+    posterior: PhysicsPosterior | None = None
     history: list[tuple[Proposal, TensorDict]] = []
     for index in range(rounds):
         theta = draw(proposal, simulations, key=(seed, "theta", index))
         history.append((proposal, pairs_of(theta, simulator(theta))))
-        if correction == "analytic":
-            history = history[-1:]
+        if correction == "analytic":  # more of one proposal after a refusal
+            history = [entry for entry in history if entry[0] is proposal]
         pairs = _pairs(history, prior, weighted=correction != "analytic")
-        posterior, report = learn(
+        learned, report = learn(
             pairs,
             prior,
             observed,
@@ -125,14 +130,29 @@ def sequential(
             seeds=[seed, *(seed_from(seed, "network", i) for i in range(1, networks))],
             fit_options=fit_options,
         )
-        repaired = 0
-        if correction == "analytic" and index > 0:
-            posterior, repaired = analytic_correction(posterior, proposal)
+        repaired, refused = 0, False
+        if correction == "analytic" and posterior is not None:
+            posterior, repaired, refused = _divided(learned, proposal, posterior)
+        else:
+            posterior = learned
         for doubt in doubts(pairs["summary"], observed, posterior):
             warnings.warn(doubt, stacklevel=2)
         effective = effective_sample_size(pairs["weight"])
-        yield SequentialRound(index, posterior, report, effective, repaired)
-        proposal = _next_proposal(posterior, prior, correction, prior_share)
+        yield SequentialRound(index, posterior, report, effective, repaired, refused)
+        if not refused:
+            proposal = _next_proposal(posterior, prior, correction, prior_share)
+
+
+def _divided(
+    learned: PhysicsPosterior, proposal: PhysicsPosterior, last: PhysicsPosterior
+) -> tuple[PhysicsPosterior, int, bool]:
+    """Return the corrected posterior, the repairs, and whether it is the last one instead."""
+    try:
+        posterior, repaired, dropped, _ = analytic_correction(learned, proposal)
+    except SimulationError as refusal:
+        warnings.warn(f"{refusal} The posterior of the round before stays.", stacklevel=3)
+        return last, 0, True
+    return posterior, repaired + dropped, False
 
 
 def _pairs(
