@@ -103,6 +103,7 @@ def times():
             *("rows in reverse", "time stands still", "no time"),
         }:
             yield refused(f"{name} in all", every(edit), "logs that can be used")
+    yield refused("rows a day apart", every(scale(T, 8.64e6)), "logs that can be used")
     for unit, factor in ("ms", 1e3), ("us", 1e6), ("ns", 1e9):
         yield found(f"one log in {unit}", change(scale(T, factor)), "run2.csv time_unit")
         yield refused(f"all logs in {unit}", every(scale(T, factor)), "seconds?")

@@ -28,6 +28,7 @@ from .velocity import Windows, angular_velocity, velocity
 
 Array = NDArray[np.float64]
 _GAP = 5.0  # steps without a row after which a record is split
+_COARSEST = 10.0  # control steps that rows may usually be apart, to be interpolated
 _ROTATIONS = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
 
 
@@ -68,7 +69,8 @@ def _parts(record: Record, system: System, leave_out: Iterable[tuple[int, int]])
         got = f"{record.time[row]:g} s after {record.time[row - 1]:g} s in row {row}"
         raise ValueError(message(f"increasing time in {record.name}", got))
     usual = np.median(steps[good[1:] & good[:-1]]) if (good[1:] & good[:-1]).any() else 0.0
-    together = good[1:] & good[:-1] & (steps <= _GAP * max(usual, system.control_dt))
+    dt = system.control_dt
+    together = good[1:] & good[:-1] & (steps <= _GAP * min(max(usual, dt), _COARSEST * dt))
     edges = np.flatnonzero(~together) + 1
     for begin, end in zip([0, *edges], [*edges, len(record)], strict=True):
         if end - begin > 1:
