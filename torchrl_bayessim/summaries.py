@@ -214,7 +214,8 @@ class SummaryStatistics(TensorDictModuleBase):
 
     Raises:
         TypeError: For what is not a function.
-        ValueError: For no functions; in a call, for discrete actions given as indices, or no step.
+        ValueError: For no functions; in a call, for discrete actions given as indices, no step, or
+            no batch size.
         KeyError: In a call, for a missing entry.
 
     Example:
@@ -281,7 +282,10 @@ class SummaryStatistics(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``{"summary": (*, L)[, "theta": (*, D)]}`` of trajectories ``[*, T]``."""
+        if not tensordict.ndim:
+            raise ValueError(message("trajectories of batch size [*, T]", "no batch size"))
         if "mask" not in tensordict.keys():  # noqa: SIM118 (TensorDict iterates rows)
+            _check_entries(tensordict, self.in_keys)
             tensordict = first_trajectories(tensordict)
         values = self._values(tensordict)
         out = TensorDict({}, batch_size=tensordict.batch_size[:-1])

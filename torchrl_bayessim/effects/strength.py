@@ -25,7 +25,8 @@ def strength_of(name: str, strength: Strength, targets: tuple[str, ...]) -> Tens
 
     Raises:
         KeyError: There is no such target.
-        ValueError: There are no targets, or the strengths have another shape or are not finite.
+        ValueError: There are no targets, or the strengths are no numbers, have another shape or are
+            not finite.
 
     Example:
         >>> strength_of("coulomb_friction", {"knee": 0.1}, ("hip", "knee"))
@@ -37,12 +38,16 @@ def strength_of(name: str, strength: Strength, targets: tuple[str, ...]) -> Tens
         for target in strength:
             if target not in targets:
                 raise KeyError(message(f"a target of {name}", target, available=targets))
-        given = {t: torch.as_tensor(s, dtype=torch.float64) for t, s in strength.items()}
+        given = {t: _numbers(s, name) for t, s in strength.items()}
         zero = torch.zeros((), dtype=torch.float64)
-        columns = torch.broadcast_tensors(*(given.get(t, zero) for t in targets))
+        try:
+            columns = torch.broadcast_tensors(*(given.get(t, zero) for t in targets))
+        except RuntimeError:
+            shapes = {t: tuple(value.shape) for t, value in given.items()}
+            raise ValueError(message(f"strengths of {name} of one shape", shapes)) from None
         values = torch.stack(columns, -1)
     else:
-        values = torch.as_tensor(strength, dtype=torch.float64)
+        values = _numbers(strength, name)
         values = values.expand(len(targets)) if values.ndim == 0 else values
     if values.shape[-1] != len(targets):
         expected = f"one strength of {name} for each of {targets}"
@@ -50,3 +55,10 @@ def strength_of(name: str, strength: Strength, targets: tuple[str, ...]) -> Tens
     if not values.isfinite().all():
         raise ValueError(message(f"finite strengths of {name}", values.tolist()))
     return values
+
+
+def _numbers(value: object, name: str) -> Tensor:
+    try:
+        return torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise ValueError(message(f"strengths of {name} in numbers", value)) from None

@@ -16,7 +16,7 @@ from __future__ import annotations
 __all__ = ["BoxPrior", "GaussianPrior", "Prior"]
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -107,6 +107,9 @@ class Prior(Distribution):
             )
 
 
+_LARGEST = 1e18  # of bounds, means and deviations
+
+
 class BoxPrior(Prior):
     r"""Independent uniform (or log-uniform) parameters on a box.
 
@@ -125,7 +128,7 @@ class BoxPrior(Prior):
         ValueError: For no parameters, duplicate names, reversed, equal, infinite or NaN bounds,
             bounds that float32 cannot tell apart, and a logarithmic parameter whose lower bound is
             not positive.
-        TypeError: ``log`` is a string and not a list of names.
+        TypeError: ``log`` is a string and not a list of names, or a name is no string.
 
     Example:
         >>> prior = BoxPrior({"mass": (2.0, 6.0), "damping": (0.01, 1.0)}, log=["damping"],
@@ -238,13 +241,14 @@ class BoxPrior(Prior):
 def _check_bounds(
     pairs: Sequence[tuple[str, tuple[float, float]]], names: Sequence[str], log: Sequence[str]
 ) -> None:
-    if isinstance(log, str):
-        raise TypeError(message("log= to be a list of names", log, hint=f"log=[{log!r}]"))
+    if isinstance(log, str) or not isinstance(log, Iterable):
+        raise TypeError(message("log= to be a list of names", log, hint=f"log=[{str(log)!r}]"))
     for name, (low, high) in pairs:
-        if not all(abs(bound) <= torch.finfo(torch.float32).max for bound in (low, high)):
+        if not all(abs(bound) <= _LARGEST for bound in (low, high)):
             raise ValueError(
                 message(
-                    f"finite bounds for {name!r} (a uniform density needs a finite box)",
+                    f"finite bounds for {name!r} (a uniform density needs a finite box, and "
+                    f"float32 the squares of numbers up to {_LARGEST:g})",
                     (low, high),
                     hint="finite bounds, or GaussianPrior for an unbounded parameter",
                 )
@@ -301,10 +305,9 @@ class GaussianPrior(Prior):
         pairs = _as_list(moments, "(mean, standard deviation)")
         names = [name for name, _ in pairs]
         for name, (mean, sd) in pairs:
-            if not (math.isfinite(mean) and math.isfinite(sd) and sd > 0):
-                raise ValueError(
-                    message(f"a finite mean and a positive deviation for {name!r}", (mean, sd))
-                )
+            if not (abs(mean) <= _LARGEST and 0 < sd <= _LARGEST and np.float32(sd) > 0):
+                expected = f"a finite mean and a positive deviation for {name!r} (in float32)"
+                raise ValueError(message(expected, (mean, sd)))
         mean = torch.tensor([m for _, (m, _) in pairs], dtype=torch.float64)
         sd = torch.tensor([s for _, (_, s) in pairs], dtype=torch.float64)
         self.standardization = Standardization(

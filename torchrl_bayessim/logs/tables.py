@@ -234,6 +234,8 @@ def _table(name: str, arrays: Mapping[str, NDArray[Any]], system: System) -> Tab
         columns |= _by_joint(key.rpartition(".")[2], flat, system.task.model)
     names, time = system.columns.used(), system.columns.time
     if time is not None and time not in columns:
+        if not arrays:
+            raise ValueError(message(f"columns in {name}", "none"))
         length = len(next(iter(arrays.values())))
         columns[time] = system.control_dt * np.arange(length, dtype=np.float64)
     _check_names(names, list(columns), name)
