@@ -12,6 +12,7 @@ from torchrl.trainers.algorithms.ppo import PPOTrainer
 from torchrl_bayessim import checkpoint
 from torchrl_bayessim.agents.ppo import PPO
 from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
+from torchrl_bayessim.errors import PhysicsError
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.inference.refinement import PosteriorRefinement
@@ -247,6 +248,34 @@ def test_trainers_that_could_mix_policies_or_episodes_are_refused():
             make_hook(None).register(make_trainer(agent, collector, 1))
     finally:
         collector.shutdown()
+
+
+def test_a_randomizer_that_the_collector_does_not_step_is_refused():
+    trainer, agent, _ = direct()
+    other = make_env().transform[1]
+    with pytest.raises(ValueError, match=r"the Collector does not step.*randomizer=None"):
+        make_hook(other).register(trainer)
+    # environments in another process hold copies of the randomizer here, which nothing reaches
+    options = {"frames_per_batch": FRAMES, "total_frames": FRAMES, "reset_at_each_iter": True}
+    env = make_env()
+    collector = MultiSyncCollector([env], agent.policy, **options)
+    try:
+        with pytest.raises(ValueError, match="the MultiSyncCollector does not step"):
+            make_hook(env.transform[1]).register(make_trainer(agent, collector, 1))
+    finally:
+        collector.shutdown()
+
+
+@pytest.mark.parametrize("meddle", ["pin", "assign"])
+def test_pairs_that_were_not_drawn_from_the_proposal_are_refused(meddle):
+    trainer, _, randomizer = direct()
+    make_hook(randomizer).register(trainer)
+    if meddle == "pin":
+        randomizer.pin([0.5])
+    else:
+        randomizer.source = BoxPrior({"length": (0.2, 1.0)})
+    with pytest.raises(PhysicsError, match="drawn from where the posterior is to be learned"):
+        trainer.train()
 
 
 def test_a_worker_that_cannot_be_told_is_refused():

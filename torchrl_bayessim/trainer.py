@@ -21,12 +21,13 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.collectors import BaseCollector, MultiAsyncCollector
+from torchrl.envs import EnvBase
 from torchrl.trainers import Trainer, TrainerHookBase
 
-from .errors import message
+from .errors import PhysicsError, message
 from .inference.fit import FitReport
 from .inference.refinement import PosteriorRefinement
-from .remote_source import push_source
+from .remote_source import PolicyWithSource, push_source
 from .robots import RealSystem, comparable
 from .sources import Defensive, Source
 from .summaries import SummaryStatistics
@@ -55,7 +56,9 @@ class PosteriorTrainerHook(TrainerHookBase):
 
     Raises:
         ValueError: An interval below 2; at registration, a trainer whose batches do not begin with
-            a reset or may be made by several policies.
+            a reset or may be made by several policies, or a randomizer that its collector does not
+            step.
+        PhysicsError: The batch of the pairs was not drawn from where the posterior is learned.
         RuntimeError: The policy was changed while the batch of the pairs was collected.
 
     Example:
@@ -122,6 +125,7 @@ class PosteriorTrainerHook(TrainerHookBase):
         self._batches = 0  # processed so far
         self._collector: BaseCollector | None = None
         self._noted: dict[str, Tensor] = {}
+        self._source: Source | None = None
 
     def register(self, trainer: Trainer, name: str = "posterior") -> None:
         """Add the hook to ``trainer``, after the hooks that push weights to its collector."""
@@ -141,6 +145,15 @@ class PosteriorTrainerHook(TrainerHookBase):
                     "batches that begin with a reset",
                     f"a {type(collector).__name__} that goes on with running episodes",
                     hint="reset_at_each_iter=True",
+                )
+            )
+        if self.randomizer is not None and not self.randomizer.drives(_environment(collector)):
+            raise ValueError(
+                message(
+                    "a randomizer among the transforms of the collector's environment",
+                    f"one that the {type(collector).__name__} does not step",
+                    hint="for environments in other processes randomizer=None, and "
+                    "PolicyWithSource(policy, prior) as the collector's policy",
                 )
             )
         self._collector = collector
@@ -192,10 +205,30 @@ class PosteriorTrainerHook(TrainerHookBase):
         real = self.robot.rollouts(policy, episodes=self.episodes, key=key)
         real = comparable(real, horizon=batch.shape[-1])
         pairs = self.statistics(batch)
+        self._check_drawn(pairs.get("theta", None))
         observed = self.statistics(real).get("summary")
         self.report = self.refinement.learn(
             pairs.get("theta"), pairs.get("summary"), observed, key=key
         )
+
+    def _check_drawn(self, theta: Tensor | None) -> None:
+        """Refuse pairs that were not drawn from the proposal."""
+        if self.randomizer is not None:
+            drawn = self.randomizer.source is self._source and self.randomizer.pinned is None
+        else:
+            carrier = PolicyWithSource.inside(self._policy())
+            assert carrier is not None  # it was pushed to
+            table = {tuple(row) for row in carrier.draws.tolist()}
+            drawn = theta is not None and all(tuple(row) in table for row in theta.tolist())
+        if theta is None or not drawn:
+            raise PhysicsError(
+                message(
+                    "a batch of parameters drawn from where the posterior is to be learned",
+                    "no parameters" if theta is None else f"others, {theta[0].tolist()} first",
+                    hint="a DomainRandomizer in every environment, not pinned, and its source left "
+                    "to this hook",
+                )
+            )
 
     def _draw_next(self) -> None:
         """Choose where the next batch is drawn from, and note whose it will be."""
@@ -207,6 +240,7 @@ class PosteriorTrainerHook(TrainerHookBase):
             self._draw_from(Defensive(posterior, self.refinement.prior, self.prior_share))
 
     def _draw_from(self, source: Source) -> None:
+        self._source = source
         if self.randomizer is not None:
             self.randomizer.source = source
         elif self._collector is not None:
@@ -226,3 +260,9 @@ class PosteriorTrainerHook(TrainerHookBase):
         self.refinement.load_state_dict(state_dict["refinement"])
         if self._collector is not None:
             self._draw_next()
+
+
+def _environment(collector: Any) -> EnvBase | None:
+    """Return the environment that a collector steps in this process, None if it has none here."""
+    env = getattr(collector, "env", None)
+    return env if isinstance(env, EnvBase) else None

@@ -11,7 +11,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.collectors import BaseCollector
-from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform, TransformedEnv
 
 from ..episode_draws import EpisodeDraws
 from ..errors import PhysicsError, message
@@ -116,6 +116,11 @@ class DomainRandomizer(Transform):
             expected = "numbers to pin, one for each parameter"
             raise TypeError(message(expected, theta, hint=f"the order {self.names}")) from None
 
+    @property
+    def pinned(self) -> Tensor | None:
+        """The θ of `pin`, None if draws are on."""
+        return self._shared["pinned"]
+
     def unpin(self) -> None:
         """Draw again from the next resets on."""
         self._shared["pinned"] = None
@@ -127,6 +132,15 @@ class DomainRandomizer(Transform):
         if self.collector is not None:
             copy._clone_of = ref(self.collector)
         return copy
+
+    def drives(self, env: EnvBase | None) -> bool:
+        """Return whether this randomizer, or a clone, is among the transforms of ``env``."""
+        while isinstance(env, TransformedEnv):
+            for module in env.transform.modules():
+                if isinstance(module, DomainRandomizer) and module._shared is self._shared:
+                    return True
+            env = env.base_env
+        return False
 
     @property
     def collector(self) -> BaseCollector | None:
@@ -201,7 +215,7 @@ class DomainRandomizer(Transform):
         )
 
     def _draw(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
-        pinned = self._shared["pinned"]
+        pinned = self.pinned
         if pinned is not None:
             if pinned.shape not in (shape, shape[-1:]):
                 raise ValueError(
@@ -260,7 +274,7 @@ class DomainRandomizer(Transform):
                     "ApplyPhysics?",
                 )
             )
-        if self._shared["pinned"] is None:
+        if self.pinned is None:
             self._episodes[: mask.numel()] += mask.flatten().cpu()
         return tensordict_reset
 
