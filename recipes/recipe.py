@@ -50,22 +50,22 @@ def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> No
     """Run ``job(settings, folder)`` with the command line's settings, and report its result.
 
     The settings are written before the job where a run can be resumed, and with its result
-    otherwise: input that is refused leaves the folder as it was.
+    otherwise: input that is refused leaves the folder as it was. A folder that holds a run that
+    can be resumed is not taken for another.
     """
     name = Path(sys.argv[0]).stem
     start = time.monotonic()
-    debug = "debug=true" in sys.argv[1:]
     made: list[Path] = []
     try:
         settings = parse(settings_type, sys.argv[1:])
         folder = Path(settings.out or f"outputs/{name}/{datetime.now():%Y-%m-%d_%H-%M-%S}")
         made = opened(folder)
         if hasattr(settings, "resume"):
-            note(settings, folder)
+            made = [*begun(settings, folder), *made]
         result = job(settings, folder)
     except (ValueError, TypeError, KeyError, OSError, ImportError, BayesSimError) as error:
         leave(made)
-        if debug:
+        if debugging(sys.argv[1:]):
             raise
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
         print(f"{name}: {' '.join(str(text).split())}", file=sys.stderr)
@@ -96,11 +96,39 @@ def opened(folder: Path) -> list[Path]:
     return missing
 
 
+def begun(settings: Settings, folder: Path) -> list[Path]:
+    """Note the settings of a run that can be resumed; return the file if it is new.
+
+    Raises:
+        ValueError: The folder holds another run.
+    """
+    path = folder / "settings.json"
+    if getattr(settings, "resume", ""):
+        note(settings, folder)
+        return []
+    if path.exists() or (folder / "checkpoint.pt").exists():
+        hint = f"another out=, or resume={folder} to go on with that run"
+        raise ValueError(message("out= to be a folder without a run", str(folder), hint=hint))
+    note(settings, folder)
+    return [path]
+
+
 def leave(made: list[Path]) -> None:
-    """Remove folders that were made for a run, where nothing was written into them."""
+    """Remove what was made for a run, where the job wrote no file beside it."""
+    noted = [path for path in made if path.is_file()]
+    for path in noted:
+        written = (file for file in path.parent.rglob("*") if file.is_file())
+        if all(file == path for file in written):
+            path.unlink()
     for path in made:
         with suppress(OSError):
             path.rmdir()
+
+
+def debugging(arguments: list[str]) -> bool:
+    """Return whether ``debug=true``, in any of YAML's spellings, is among the arguments."""
+    values = [a.partition("=")[2].lower() for a in arguments if a.partition("=")[0] == "debug"]
+    return bool(values) and values[-1] in {"true", "yes", "on", "1"}
 
 
 def note(settings: Settings, folder: Path) -> None:

@@ -169,6 +169,33 @@ def test_bad_settings_are_explained(arguments, said, refused, tmp_path):
     assert not (tmp_path / "nowhere").exists()
 
 
+def test_refused_input_leaves_no_run_behind(refused, tmp_path):
+    for wrong in ("task=cartpol", "rounds=0"):  # refused by the recipe, and by the loop
+        assert "expected" in refused(wrong, "out=run")
+        assert not (tmp_path / "run" / "settings.json").exists()
+
+
+def test_a_folder_that_holds_a_run_is_not_taken_for_another(finished, refused):
+    folder, _ = finished
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    for arguments in (TINY, ["task=cartpol"]):
+        said = refused(*arguments, f"out={folder}")
+        assert "out= to be a folder without a run" in said
+        assert f"Try: another out=, or resume={folder}" in said
+    assert "seed=0, as in the run to resume" in refused(f"resume={folder}", "seed=3")
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("debug", ["true", "True", "yes", "1"])
+def test_debug_shows_the_traceback_however_it_is_spelt(debug, refused, monkeypatch):
+    import recipe
+    import sim2real_ppo
+
+    monkeypatch.setattr(sys, "argv", ["sim2real_ppo.py", "task=cartpol", f"debug={debug}"])
+    with pytest.raises(ValueError, match="cartpol"):
+        recipe.main(sim2real_ppo.Sim2Real, sim2real_ppo.job)
+
+
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
