@@ -342,3 +342,38 @@ def test_paper_mode_learns_and_keeps_to_the_support(features):
 def test_paper_mode_knows_its_feature_maps():
     with pytest.raises(ValueError, match="the name of a feature map"):
         MixtureDensityPosterior.paper_mode(BoxPrior({"a": (0.0, 1.0)}), 2, features="rff")
+
+
+def fitted(prior):
+    found = posterior(prior, dim=2)
+    theta = prior.sample((300,), generator=generator("fitted"))
+    pairs = TensorDict({"theta": theta, "summary": theta[:, :1] / 400 + summaries(300, 2)}, [300])
+    fit(found, pairs, epochs=1, progress=False)
+    return found
+
+
+def test_a_loaded_posterior_is_the_saved_one_and_warns_as_it_did(tmp_path):
+    saved, loaded = fitted(ONE["linear"]), posterior(ONE["linear"], dim=2, seed=9)
+    torch.save(saved.state_dict(), tmp_path / "posterior.pt")
+    loaded.load_state_dict(torch.load(tmp_path / "posterior.pt", weights_only=True))
+    near, theta = summaries(1, 2), ONE["linear"].sample((5,))
+    densities = [each.condition(near).log_prob(theta) for each in (saved, loaded)]
+    assert torch.equal(*densities)
+    with pytest.warns(UserWarning, match="1 of 1 real summaries lie as far out"):
+        loaded.condition(near + 100)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        BoxPrior({"mass": (200.0, 601.0)}),
+        BoxPrior({"mass": (200.0, 600.0)}, log=["mass"]),
+        BoxPrior({"weight": (200.0, 600.0)}),
+        BoxPrior({"mass": (200.0, 600.0001)}),
+        GaussianPrior({"mass": (400.0, 50.0)}),
+    ],
+    ids=repr,
+)
+def test_weights_of_another_prior_are_refused(other):
+    with pytest.raises(ValueError, match=r"weights fitted under .*Try: a posterior over the prior"):
+        posterior(other, dim=2).load_state_dict(posterior(ONE["linear"], dim=2).state_dict())

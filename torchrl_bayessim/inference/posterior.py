@@ -17,7 +17,7 @@ __all__ = ["MixtureDensityPosterior"]
 
 import warnings
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -50,6 +50,9 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
     ``posterior.condition(real)`` the one posterior for all the real trajectories together, which
     can be assigned to a randomizer's ``source``.
 
+    Its ``state_dict`` holds what identifies the prior, and ``seen``: weights that were fitted under
+    another prior are refused, and what was loaded warns as what was fitted does.
+
     Args:
         prior: Names, units, support and scaling of the parameters.
         summary_dim: Size L of the summary statistics.
@@ -64,6 +67,10 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
     Attributes:
         seen: Summaries that it was fitted to, up to a thousand; ``None`` before a fit.
         held_out: Pairs that chose the best epoch of an unweighted fit.
+
+    Raises:
+        TypeError: The prior is none of :mod:`.priors`.
+        ValueError: An unknown feature map; when a state is loaded, one of another prior.
 
     Example:
         >>> from tensordict import TensorDict
@@ -226,6 +233,23 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
             for doubt in doubts(self.seen, summaries, found):
                 warnings.warn(doubt, stacklevel=2)
         return found
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return what identifies the prior, and the summaries that it was fitted to."""
+        return {"prior": dict(self.prior.settings), "seen": self.seen}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Refuse weights that were fitted under another prior; take over the summaries."""
+        fitted = dict(state["prior"])
+        if fitted != self.prior.settings:
+            raise ValueError(
+                message(
+                    f"weights fitted under {self.prior.settings}",
+                    fitted,
+                    hint="a posterior over the prior that they were fitted under",
+                )
+            )
+        self.seen = state["seen"]
 
     def extra_repr(self) -> str:
         """Show the prior."""

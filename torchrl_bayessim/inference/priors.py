@@ -17,7 +17,7 @@ __all__ = ["BoxPrior", "GaussianPrior", "Prior"]
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -66,6 +66,7 @@ class Prior(Distribution):
         units: One unit per parameter, ``""`` where none was given.
         standardization: The transform :math:`z \mapsto \theta`.
         bijection: A transform from all of R^D onto the support.
+        settings: Plain values that tell it from any other prior, exactly.
         box: The support in standardised coordinates, ``(low, high)``; ``None`` if all of R^D.
     """
 
@@ -75,6 +76,7 @@ class Prior(Distribution):
     standardization: Standardization
     bijection: Transform
     box: tuple[Tensor, Tensor] | None
+    settings: dict[str, list[Any]]
 
     def _name(self, names: Sequence[str], units: Mapping[str, str] | None) -> None:
         units = units or {}
@@ -168,6 +170,12 @@ class BoxPrior(Prior):
             ]
         )
         self._name(names, units)
+        self.settings = {
+            "names": names,
+            "low": self.low.tolist(),
+            "high": self.high.tolist(),
+            "log": self.log.tolist(),
+        }
 
     def _u(self, theta: Tensor) -> Tensor:
         return torch.where(self.log, torch.where(self.log, theta, 1.0).log(), theta)
@@ -318,6 +326,11 @@ class GaussianPrior(Prior):
         self.box = None
         self.bijection = self.standardization
         self._name(names, units)
+        self.settings = {
+            "names": names,
+            "mean": mean.tolist(),
+            "scale_tril": self.standardization.scale_tril.tolist(),
+        }
 
     @property
     def support(self) -> constraints.Constraint:  # noqa: D102 (documented by torch)
