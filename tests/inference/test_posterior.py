@@ -377,3 +377,26 @@ def test_a_loaded_posterior_is_the_saved_one_and_warns_as_it_did(tmp_path):
 def test_weights_of_another_prior_are_refused(other):
     with pytest.raises(ValueError, match=r"weights fitted under .*Try: a posterior over the prior"):
         posterior(other, dim=2).load_state_dict(posterior(ONE["linear"], dim=2).state_dict())
+
+
+@pytest.mark.parametrize("name", TWO)
+def test_a_moved_posterior_computes_where_it_is(name):
+    """The meta device refuses every operation with a tensor that was left behind."""
+    moved = posterior(TWO[name], covariance="diagonal").to("meta")
+    q = moved.distribution(torch.zeros(3, 5, device="meta"))
+    theta = q.sample((4,))
+    assert theta.shape == (4, 3, 2)
+    for found in (theta, q.log_prob(theta), q.mean, q.variance):
+        assert found.device.type == "meta"
+    q.log_prob(theta).sum().backward()
+
+
+def test_a_posterior_in_double_precision_gives_the_same():
+    q, double = posterior(seed=1), posterior(seed=1).double()
+    real, theta = summaries(2, 5), TWO["box"].sample((4,))
+    torch.testing.assert_close(
+        double.condition(real.double()).log_prob(theta),
+        q.condition(real).log_prob(theta),
+        rtol=1e-3,
+        atol=1e-3,
+    )

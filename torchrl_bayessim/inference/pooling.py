@@ -40,7 +40,7 @@ def pool(each: TruncatedGaussianMixture, *, bounded: bool) -> TruncatedGaussianM
     order = sorted(range(len(keys)), key=keys.__getitem__)
     factors = [Mixture(each.untruncated_logits[i], each.loc[i], each.scale_tril[i]) for i in order]
     product = factors[0]
-    identity = torch.eye(each.loc.shape[-1], dtype=each.loc.dtype)
+    identity = torch.eye(each.loc.shape[-1]).to(each.loc)
     for factor in factors[1:]:
         product = multiply(product, factor)
         if not bounded:

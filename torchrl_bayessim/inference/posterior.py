@@ -205,7 +205,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
             ValueError: For no summaries, wrong shapes, NaN or infinite statistics.
         """
         given, size = torch.as_tensor(summaries), len(self.network.shift)
-        summaries = torch.atleast_2d(given)
+        summaries = torch.atleast_2d(given.to(self.network.shift.device))
         if summaries.shape != (len(summaries), size) or len(summaries) == 0:
             raise ValueError(
                 message(
@@ -230,7 +230,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         each = self.distribution(summaries).mixture
         found = PhysicsPosterior(pool(each, bounded=self.prior.box is not None), self.prior)
         if check and self.seen is not None:
-            for doubt in doubts(self.seen, summaries, found):
+            for doubt in doubts(self.seen.to(summaries), summaries, found):
                 warnings.warn(doubt, stacklevel=2)
         return found
 

@@ -228,9 +228,10 @@ class BoxPrior(Prior):
         """Return which parameters lie in the box (up to rounding), boolean, shape ``(*)``."""
         self._check_event(theta)
         width = self.high - self.low
-        below = 1e-6 * torch.where(self.log, self.low, width)
-        above = 1e-6 * torch.where(self.log, self.high, width)
-        return ((theta >= self.low - below) & (theta <= self.high + above)).all(-1)
+        below = self.low - 1e-6 * torch.where(self.log, self.low, width)
+        above = self.high + 1e-6 * torch.where(self.log, self.high, width)
+        low, high = below.to(theta.device), above.to(theta.device)
+        return ((theta >= low) & (theta <= high)).all(-1)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-density, ``-inf`` outside the box, shape ``(*)``."""

@@ -32,22 +32,27 @@ class Standardization(Transform):
         self.mean, self.scale_tril, self.log = mean, scale_tril, log
 
     def _call(self, x: Tensor) -> Tensor:
-        u = self.mean.to(x.dtype) + x @ self.scale_tril.to(x.dtype).mT
-        return torch.where(self.log, u.exp(), u) if self.log.any() else u
+        mean, scale, log = self._at(x)
+        u = mean + x @ scale.mT
+        return torch.where(log, u.exp(), u) if self.log.any() else u
 
     def _inverse(self, y: Tensor) -> Tensor:
-        u = torch.where(self.log, self._log(y), y) if self.log.any() else y
-        centred = (u - self.mean.to(y.dtype)).unsqueeze(-1)
-        scale = self.scale_tril.to(y.dtype)
+        mean, scale, log = self._at(y)
+        u = torch.where(log, self._log(y), y) if self.log.any() else y
+        centred = (u - mean).unsqueeze(-1)
         return torch.linalg.solve_triangular(scale, centred, upper=False).squeeze(-1)
+
+    def _at(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what it is made of, where ``x`` is and as precise."""
+        return self.mean.to(x), self.scale_tril.to(x), self.log.to(x.device)
 
     def log_abs_det_jacobian(self, x: Tensor, y: Tensor) -> Tensor:
         r"""Return :math:`\log |\partial\theta / \partial z|`, shape ``(*)``."""
-        volume = self.scale_tril.diagonal().log().sum().to(x.dtype)
+        volume = self.scale_tril.diagonal().log().sum().to(x)
         if not self.log.any():
             return volume.expand(x.shape[:-1])
         return volume + self._log(y).sum(-1)
 
     def _log(self, y: Tensor) -> Tensor:
         """Return the logarithm of logarithmic parameters, finite below 0, and 0 for others."""
-        return torch.where(self.log, y.clamp_min(torch.finfo(y.dtype).tiny), 1.0).log()
+        return torch.where(self.log.to(y.device), y.clamp_min(torch.finfo(y.dtype).tiny), 1.0).log()

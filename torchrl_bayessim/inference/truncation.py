@@ -46,7 +46,7 @@ def _chain(
 ) -> tuple[list[Tensor], Tensor]:
     """Return the noise of as many coordinates as ``u`` has columns, and the log of the product."""
     noise: list[Tensor] = []
-    log_weight = torch.zeros((), dtype=loc.dtype)
+    log_weight = torch.zeros((), dtype=loc.dtype, device=loc.device)
     for d in range(loc.shape[-1]):
         shift = loc[..., d]
         if noise:
@@ -101,11 +101,11 @@ def log_mass(
     # of a component that ends far inside, nothing is cut off: most are, once a network has learned
     cut = (torch.maximum(a, -b) > -INSIDE).any(-1)
     loc, scale_tril = loc[cut], scale_tril[cut]
-    u = _points(loc.shape[-1], points).unsqueeze(1)
+    u = _points(loc.shape[-1], points).unsqueeze(1).to(loc.device)
     # no limit depends on the last coordinate
     _, log_weight = _chain(loc.unsqueeze(0), scale_tril.unsqueeze(0), box, u[..., :-1])
     mass = log_weight.logsumexp(0) - math.log(len(log_weight))
-    return torch.zeros(cut.shape, dtype=loc.dtype).masked_scatter(cut, mass)
+    return torch.zeros_like(cut, dtype=loc.dtype).masked_scatter(cut, mass)
 
 
 class TruncatedGaussianMixture(Distribution):
@@ -149,7 +149,7 @@ class TruncatedGaussianMixture(Distribution):
     ) -> None:
         self.logits = logits.double().log_softmax(-1)
         self.loc, self.scale_tril = loc.double(), scale_tril.double()
-        self.box = None if box is None else (box[0].double(), box[1].double())
+        self.box = None if box is None else (box[0].to(self.loc), box[1].to(self.loc))
         self.diagonal, self.points = diagonal or loc.shape[-1] == 1, points
         self._log_mass: Tensor | None = None
         super().__init__(logits.shape[:-1], loc.shape[-1:], validate_args=False)
@@ -215,10 +215,10 @@ class TruncatedGaussianMixture(Distribution):
             shape = Size(sample_shape)
             count = math.prod(shape)
             flat = self.logits.reshape(-1, self.logits.shape[-1])
-            index = torch.multinomial(
-                flat.exp(), max(count, 1), replacement=True, generator=generator
-            )
-            index = index.T[:count].reshape((*shape, *self.batch_shape))
+            # draws are made where the generator is
+            weight = flat.exp() if generator is None else flat.exp().to(generator.device)
+            index = torch.multinomial(weight, max(count, 1), replacement=True, generator=generator)
+            index = index.to(flat.device).T[:count].reshape((*shape, *self.batch_shape))
             loc = self._pick(self.loc, index, 1)
             scale = self._pick(self.scale_tril, index, 2)
             return self._metropolis(loc, scale, generator)
@@ -235,7 +235,7 @@ class TruncatedGaussianMixture(Distribution):
         state, log_weight = self._propose(loc, scale, generator)
         for _ in range(0 if self.box is None or self.diagonal else CHAIN):
             point, log_new = self._propose(loc, scale, generator)
-            chance = torch.rand(log_new.shape, dtype=loc.dtype, generator=generator)
+            chance = _rand(log_new, generator)
             accept = chance.log() < log_new - log_weight
             state = torch.where(accept.unsqueeze(-1), point, state)
             log_weight = torch.where(accept, log_new, log_weight)
@@ -245,25 +245,32 @@ class TruncatedGaussianMixture(Distribution):
         self, loc: Tensor, scale: Tensor, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
         if self.box is None:
-            noise = torch.randn(loc.shape, dtype=loc.dtype, generator=generator)
-            point = loc + (scale @ noise.unsqueeze(-1)).squeeze(-1)
-            return point, torch.zeros(loc.shape[:-1], dtype=loc.dtype)
-        return separate(
-            loc, scale, self.box, torch.rand(loc.shape, dtype=loc.dtype, generator=generator)
-        )
+            device = loc.device if generator is None else generator.device
+            noise = torch.randn(loc.shape, dtype=loc.dtype, device=device, generator=generator)
+            point = loc + (scale @ noise.to(loc.device).unsqueeze(-1)).squeeze(-1)
+            return point, torch.zeros_like(loc[..., 0])
+        return separate(loc, scale, self.box, _rand(loc, generator))
 
     def quadrature(self, points: int = 256) -> tuple[Tensor, Tensor]:
         """Return fixed points ``(points * K, *, D)`` and weights that sum to 1 over the first axis.
 
         Quasi-random, so that moments computed from them are smooth and repeatable.
         """
-        u = _points(self.loc.shape[-1], points).reshape(points, *[1] * (self.loc.ndim - 1), -1)
+        u = _points(self.loc.shape[-1], points).to(self.loc.device)
+        u = u.reshape(points, *[1] * (self.loc.ndim - 1), -1)
         loc, scale = self.loc.unsqueeze(0), self.scale_tril.unsqueeze(0)
         if self.box is None:
             noise = torch.special.ndtri(u)
             where = loc + (scale @ noise.unsqueeze(-1)).squeeze(-1)
-            log_weight = torch.zeros(where.shape[:-1], dtype=where.dtype)
+            log_weight = torch.zeros_like(where[..., 0])
         else:
             where, log_weight = separate(loc, scale, self.box, u)
         weight = (log_weight.log_softmax(0) + self.logits).exp()
         return where.movedim(-2, 1).flatten(0, 1), weight.movedim(-1, 1).flatten(0, 1)
+
+
+def _rand(like: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Return uniforms of the shape of ``like``, drawn where the generator is."""
+    device = like.device if generator is None else generator.device
+    uniform = torch.rand(like.shape, dtype=like.dtype, device=device, generator=generator)
+    return uniform.to(like.device)
