@@ -197,8 +197,9 @@ def test_the_same_seed_gives_the_same_fit(features):
     )
     assert first == second
     assert first.validation != other.validation
-    for name, value in nets[0].state_dict().items():
-        assert torch.equal(value, nets[1].state_dict()[name]), name
+    weights = [net.network.state_dict() for net in nets]
+    for name, value in weights[0].items():
+        assert torch.equal(value, weights[1][name]), name
 
 
 def test_the_users_generators_are_untouched():

@@ -49,12 +49,13 @@ def test_weights_weigh():
     torch.testing.assert_close(value(data, net), (weight * each).sum() / weight.sum())
 
 
+@pytest.mark.parametrize("key", ["mask", ("collector", "mask")])
 @pytest.mark.parametrize("trailing", [False, True])
-def test_masked_pairs_do_not_count(trailing):
+def test_masked_pairs_do_not_count(trailing, key):
     net, data = posterior(), pairs()
     kept = torch.tensor([True, False, True, True, False, True, True, False])
     expected = value(data[kept], net)
-    data["collector", "mask"] = kept.unsqueeze(-1) if trailing else kept
+    data[key] = kept.unsqueeze(-1) if trailing else kept
     torch.testing.assert_close(value(data, net), expected)
 
 
@@ -173,3 +174,39 @@ def test_batches_of_more_dimensions_are_one_batch():
 def test_an_unknown_reduction_is_refused():
     with pytest.raises(ValueError, match=r"a reduction, got 'average'. Available: mean, sum, none"):
         PosteriorLoss(posterior(), reduction="average")
+
+
+@pytest.mark.parametrize("entry", ["theta", "summary"])
+def test_a_missing_entry_is_named(entry):
+    with pytest.raises(KeyError, match=rf"pairs with an entry, got '{entry}'\. Available: "):
+        value(pairs().exclude(entry))
+
+
+@pytest.mark.parametrize("weight", [-1.0, torch.nan, torch.inf])
+def test_weights_that_are_none_are_refused(weight):
+    with pytest.raises(ValueError, match=r"finite weights of 0 or more, got '8 others, the first"):
+        value(pairs().set("weight", torch.full((8,), weight)))
+
+
+def test_a_mask_of_floats_is_refused():
+    with pytest.raises(TypeError, match=r"booleans in 'mask', got 'torch.float32'"):
+        value(pairs().set("mask", torch.ones(8)))
+
+
+@pytest.mark.parametrize(
+    ("entry", "bad", "said"),
+    [
+        ("summary", torch.nan, "1 with NaN or infinity, 0 outside"),
+        ("theta", torch.nan, "1 with NaN or infinity, 0 outside"),
+        ("theta", 9.0, "0 with NaN or infinity, 1 outside"),
+    ],
+)
+@pytest.mark.parametrize("reduction", ["mean", "sum"])
+def test_pairs_that_have_no_loss_are_refused_or_masked(entry, bad, said, reduction):
+    data = pairs()
+    data[entry][2] = bad
+    with pytest.raises(ValueError, match=rf"inside BoxPrior.*{said}.*Try: mask them"):
+        value(data, reduction=reduction)
+    assert value(data, reduction="none").isfinite().sum() == 7
+    data["mask"] = torch.arange(8) != 2
+    assert value(data, reduction=reduction).isfinite()

@@ -22,6 +22,7 @@ from torch import Tensor
 from torchrl.objectives.common import LossModule
 
 from ..errors import message
+from .priors import Prior
 
 
 class PosteriorLoss(LossModule):
@@ -30,10 +31,18 @@ class PosteriorLoss(LossModule):
     Args:
         posterior_network: A posterior with ``get_dist`` such as ``MixtureDensityPosterior``.
         reduction: ``"mean"`` (weighted), ``"sum"`` (weighted), or ``"none"``: one value per pair,
-            without weights and masks.
+            without weights and masks; infinite outside the prior, NaN where a summary is.
 
-    Keys (change with ``set_keys``): ``theta`` the parameters ``(*, D)``, ``weight`` importance
-    weights ``(*)``, used where present; ``mask`` booleans ``(*)``, used where present.
+    Keys (change with ``set_keys``): ``theta`` the parameters ``(*, D)``; ``weight`` importance
+    weights ``(*)``, used where present; ``mask`` booleans ``(*)``, used where present, as is
+    ``("collector", "mask")``, the one of TorchRL's collectors. A pair that is masked or of weight 0
+    may hold anything. If all are, the loss and its gradient are 0.
+
+    Raises:
+        KeyError: In a call, for pairs without parameters or summaries.
+        TypeError: For masks that are not booleans.
+        ValueError: For weights that are negative or not finite; for a mean or sum over pairs that
+            are not finite or outside the prior.
 
     Example:
         >>> from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
@@ -47,7 +56,7 @@ class PosteriorLoss(LossModule):
     class _AcceptedKeys:
         theta: NestedKey = "theta"
         weight: NestedKey = "weight"
-        mask: NestedKey = ("collector", "mask")
+        mask: NestedKey = "mask"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -79,6 +88,10 @@ class PosteriorLoss(LossModule):
     @dispatch  # pyright: ignore[reportArgumentType]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``{"loss_posterior": ...}`` for pairs of summaries and parameters."""
+        for key in self.in_keys:
+            if tensordict.get(key, None) is None:
+                found = sorted(map(str, tensordict.keys(include_nested=True)))
+                raise KeyError(message("pairs with an entry", str(key), available=found))
         theta = tensordict.get(self.tensor_keys.theta)
         inputs = tensordict.select(*self.posterior_network.in_keys)
         weight = self._weight(tensordict, theta)
@@ -87,9 +100,14 @@ class PosteriorLoss(LossModule):
             # a row of weight 0 may hold anything; NaN there would reach the gradient as 0 * NaN
             inputs = inputs.apply(lambda x: torch.where(used.unsqueeze(-1), x, 0.0))
         with self.posterior_network_params.to_module(self.posterior_network):
-            loss = -self.posterior_network.get_dist(inputs).log_prob(theta)
+            q = self.posterior_network.get_dist(inputs)
+            loss = -q.log_prob(theta)
         if self.reduction == "none":
             return TensorDict({"loss_posterior": loss})
+        if not loss[used].isfinite().all():
+            summaries = [tensordict.get(key) for key in self.posterior_network.in_keys]
+            bad = used & ~loss.isfinite()
+            _explain(summaries, theta, bad, prior=getattr(q, "prior", None))
         total = torch.where(used, weight * loss, 0.0).sum()
         if self.reduction == "mean":
             total = total / weight.sum().clamp_min(1e-12)
@@ -100,5 +118,26 @@ class PosteriorLoss(LossModule):
         shape = theta.shape[:-1]
         weight = tensordict.get(self.tensor_keys.weight, None)
         weight = theta.new_ones(shape) if weight is None else weight.reshape(shape)
-        mask = tensordict.get(self.tensor_keys.mask, None)
-        return weight if mask is None else torch.where(mask.reshape(shape), weight, 0.0)
+        for key in dict.fromkeys([self.tensor_keys.mask, ("collector", "mask")]):
+            mask = tensordict.get(key, None)
+            if mask is None:
+                continue
+            if mask.dtype != torch.bool:
+                raise TypeError(message(f"booleans in {key!r}", str(mask.dtype)))
+            weight = torch.where(mask.reshape(shape), weight, 0.0)
+        if not (weight >= 0).all() or weight.isinf().any():
+            bad = weight[~(weight >= 0) | weight.isinf()]
+            expected = "finite weights of 0 or more"
+            raise ValueError(message(expected, f"{len(bad)} others, the first {bad[0].item():.3g}"))
+        return weight
+
+
+def _explain(summaries: list[Tensor], theta: Tensor, bad: Tensor, *, prior: Prior | None) -> None:
+    """Refuse pairs at fault for a loss that is not finite; a network that diverged is another."""
+    finite = torch.stack([value.isfinite().all(-1) for value in (theta, *summaries)]).all(0)
+    outside = finite & ~prior.contains(theta) if prior is not None else torch.zeros_like(finite)
+    if not (bad & (~finite | outside)).any():
+        return
+    got = f"{int((bad & ~finite).sum())} with NaN or infinity, {int((bad & outside).sum())} outside"
+    expected = f"pairs that are finite and inside {'the prior' if prior is None else repr(prior)}"
+    raise ValueError(message(expected, got, hint="mask them, or give them weight 0"))
