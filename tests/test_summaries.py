@@ -472,6 +472,59 @@ def test_statistics_are_a_collector_s_postproc(split):
         assert len(batch["theta"].unique()) == len(batch) >= 8
 
 
+def rows(**entries):
+    """Two trajectories of six steps, with other entries where given."""
+    state, action, following, mask = trajectory(2, steps=6)
+    data = {"observation": state, "action": action, "mask": mask}
+    data |= {"next": {"observation": following, "done": torch.zeros(2, 6, 1, dtype=torch.bool)}}
+    return TensorDict(data | entries, [2, 6])
+
+
+def test_no_bit_of_a_multi_binary_action_is_lost():
+    action = torch.randint(2, (2, 6, 2), generator=generator("bits"))
+    other = torch.stack([1 - action[..., 0], action[..., 1]], -1)
+    with pytest.raises(ValueError, match=r"one-hot actions, got \[.*one_hot=False"):
+        SummaryStatistics(cross_correlation)(rows(action=action))
+    statistics = SummaryStatistics(cross_correlation, one_hot=False)
+    one, two = (statistics(rows(action=a))["summary"] for a in (action, other))
+    assert one.shape == (2, 3 * 2 + 6)
+    assert (one != two).any()
+    single = torch.randint(5, (2, 6, 1), generator=generator("choice"))  # of a multi-discrete space
+    assert statistics(rows(action=single))["summary"].shape == (2, 3 + 6)
+    assert "one_hot=False" in repr(statistics)
+
+
+@every_summary
+def test_a_trajectory_without_steps_or_with_nan_has_no_summary(summary):
+    statistics = SummaryStatistics(summary)
+    mask = torch.ones(2, 6, dtype=torch.bool)
+    mask[0] = False
+    state = rows()["observation"].clone()
+    state[0, 3, 1] = torch.nan
+    for data in (rows(mask=mask), rows(observation=state)):
+        found = statistics(data)["summary"]
+        assert found[0].isnan().all()
+        assert torch.equal(found[1], statistics(rows())["summary"][1])
+
+
+def test_trajectories_together_need_no_mask_of_the_user():
+    data, statistics = rows(), SummaryStatistics(moments, waypoints(2))
+    assert torch.equal(statistics.together(data.exclude("mask")), statistics.together(data))
+
+
+@pytest.mark.parametrize("angles", [(7,), (-4,)])
+def test_angles_in_no_column_are_refused(angles):
+    with pytest.raises(ValueError, match=r"angles among the 3 columns of 'observation', got \("):
+        SummaryStatistics(moments, angles=angles)(rows())
+
+
+def test_a_mask_of_floats_is_refused():
+    statistics = SummaryStatistics(moments)
+    for call in (statistics, statistics.together):
+        with pytest.raises(TypeError, match=r"booleans in 'mask', got 'torch.float32'"):
+            call(rows(mask=torch.ones(2, 6)))
+
+
 # --- the policy
 
 

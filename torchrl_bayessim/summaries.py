@@ -233,6 +233,7 @@ class SummaryStatistics(TensorDictModuleBase):
         action_key: NestedKey = "action",
         out_key: NestedKey = "summary",
         theta_key: NestedKey = "theta",
+        one_hot: bool = True,
     ) -> None:
         super().__init__()
         if not functions:
@@ -243,7 +244,7 @@ class SummaryStatistics(TensorDictModuleBase):
                 raise TypeError(message(expected, function, hint="summaries.linear_dynamics"))
         self.functions, self.angles = functions, tuple(angles)
         self.observation_key, self.action_key = observation_key, action_key
-        self.theta_key = theta_key
+        self.theta_key, self.one_hot = theta_key, one_hot
         self.in_keys = [observation_key, action_key, _next(observation_key), ("next", "done")]
         self.out_keys = [out_key]
 
@@ -263,6 +264,7 @@ class SummaryStatistics(TensorDictModuleBase):
             >>> SummaryStatistics(moments).together(rows.unflatten(0, (2, 4))).shape
             torch.Size([2, 8])
         """
+        trajectories = self._masked(trajectories)
         mask = trajectories.get("mask")
         # steps that do not count go to the end, as in any padded trajectory
         order = (~mask.flatten(-2)).long().argsort(dim=-1, stable=True)
@@ -284,9 +286,7 @@ class SummaryStatistics(TensorDictModuleBase):
         """Return ``{"summary": (*, L)[, "theta": (*, D)]}`` of trajectories ``[*, T]``."""
         if not tensordict.ndim:
             raise ValueError(message("trajectories of batch size [*, T]", "no batch size"))
-        if "mask" not in tensordict.keys():  # noqa: SIM118 (TensorDict iterates rows)
-            _check_entries(tensordict, self.in_keys)
-            tensordict = first_trajectories(tensordict)
+        tensordict = self._masked(tensordict)
         values = self._values(tensordict)
         out = TensorDict({}, batch_size=tensordict.batch_size[:-1])
         out.set(self.out_keys[0], torch.cat(list(values.values()), -1))
@@ -299,8 +299,37 @@ class SummaryStatistics(TensorDictModuleBase):
         """Return the values of all functions, or of those that are ``ordered`` or not."""
         _check_entries(tensordict, self.in_keys[:3])
         state, mask = tensordict.get(self.observation_key), tensordict.get("mask")
-        action = tensordict.get(self.action_key)
-        if action.ndim == mask.ndim or (action.shape[-1] == 1 and not action.is_floating_point()):
+        following = tensordict.get(_next(self.observation_key))
+        if any(not -state.shape[-1] <= column < state.shape[-1] for column in self.angles):
+            columns = f"angles among the {state.shape[-1]} columns of {self.observation_key!r}"
+            raise ValueError(message(columns, self.angles))
+        action = self._encoded(tensordict.get(self.action_key), mask)
+        # angles are unwrapped through their wrapped differences, once, for every summary
+        tau = differences(state, following, self.angles)
+        finite = torch.stack([x.isfinite().all(-1) for x in (state, action, following)]).all(0)
+        usable = (mask.any(-1) & (finite | ~mask).all(-1)).unsqueeze(-1)
+        return {
+            i: torch.where(usable, function(state, action, state + tau, mask), torch.nan)
+            for i, function in enumerate(self.functions)
+            if ordered in (None, _is_ordered(function))
+        }
+
+    def _masked(self, trajectories: TensorDictBase) -> TensorDictBase:
+        """Return trajectories with a ``"mask"``: of each row's first one, unless there is one."""
+        mask = trajectories.get("mask", None)
+        if mask is None:
+            _check_entries(trajectories, self.in_keys)
+            return first_trajectories(trajectories)
+        if mask.dtype != torch.bool:
+            raise TypeError(message("booleans in 'mask'", str(mask.dtype), hint="mask > 0"))
+        return trajectories
+
+    def _encoded(self, action: Tensor, mask: Tensor) -> Tensor:
+        """Return actions as floats, shape ``(*, T, A)``."""
+        if action.is_floating_point() and action.ndim > mask.ndim:
+            return action
+        indices = action.ndim == mask.ndim or action.shape[-1] == 1
+        if indices and (self.one_hot or action.ndim == mask.ndim):
             raise ValueError(
                 message(
                     "one-hot actions or torques, of shape (*, T, A)",
@@ -308,19 +337,21 @@ class SummaryStatistics(TensorDictModuleBase):
                     hint="an environment with categorical_action_encoding=False",
                 )
             )
-        action = encode_actions(action)
-        # angles are unwrapped through their wrapped differences, once, for every summary
-        tau = differences(state, tensordict.get(_next(self.observation_key)), self.angles)
-        return {
-            i: function(state, action, state + tau, mask)
-            for i, function in enumerate(self.functions)
-            if ordered in (None, _is_ordered(function))
-        }
+        if not self.one_hot:
+            return action.float()
+        encoded = encode_actions(action)
+        if action.shape[-1] == 2:  # of which one column is kept
+            wrong = action[mask & (action.long().sum(-1) != 1)]
+            if len(wrong):
+                hint = "SummaryStatistics(..., one_hot=False)"
+                raise ValueError(message("one-hot actions", wrong[0].tolist(), hint=hint))
+        return encoded
 
     def __repr__(self) -> str:
         names = [getattr(f, "__qualname__", type(f).__name__) for f in self.functions]
         keys = f"{self.observation_key!r}, {self.action_key!r} -> {self.out_keys[0]!r}"
-        return f"SummaryStatistics({', '.join(names)}, angles={self.angles}, {keys})"
+        options = "" if self.one_hot else ", one_hot=False"
+        return f"SummaryStatistics({', '.join(names)}, angles={self.angles}, {keys}{options})"
 
 
 def _check_entries(trajectories: TensorDictBase, keys: Sequence[NestedKey]) -> None:
