@@ -24,7 +24,7 @@ LAYERS = [
     {"summaries", "episode_draws", "remote_source", "inference", "agents", "replay", "effects"},
     {"logs"},
     {"transforms"},
-    {"simulate", "robots", "influence", "excitation", "diagnosis"},
+    {"diverged", "simulate", "robots", "influence", "excitation", "diagnosis"},
     {"evidence"},
     {"loop"},
     {"trainer"},

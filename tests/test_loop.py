@@ -528,7 +528,7 @@ def test_nan_from_a_simulator_is_named_and_loses_nothing(tmp_path, monkeypatch):
     turns = iter(loop)
     first = next(turns)
     monkeypatch.setattr(Diverging, "broken", True)
-    with pytest.raises(SimulationError, match=r"batch of finite observations.*simulation diverge"):
+    with pytest.raises(SimulationError, match="6 diverged simulations of 6"):
         next(turns)
     assert len(asked) == 2
     monkeypatch.setattr(Diverging, "broken", False)
@@ -537,6 +537,38 @@ def test_nan_from_a_simulator_is_named_and_loses_nothing(tmp_path, monkeypatch):
     assert second.index == 1
     assert second.frames > first.frames
     assert len(loop.state_dict()["loop"]["evidence"]) == 2
+
+
+class Brittle(CartPoleEnv):
+    """CartPole that diverges, for good, where the pole is short."""
+
+    def _step(self, tensordict):
+        out = super()._step(tensordict)
+        short = self.parameters["length"] < 0.5
+        out["observation"] = torch.where(short[:, None], torch.nan, out["observation"])
+        return out
+
+
+def test_simulations_that_give_nan_are_left_out_of_pairs_and_training(tmp_path):
+    randomizer = DomainRandomizer(PRIOR)
+    transforms = Compose(physics(), randomizer, StepCounter(50), RewardSum())
+    env = TransformedEnv(Brittle(24), transforms)
+    learner = Recorder(env)
+    loop = make_loop(env, randomizer, learner=learner, rounds=1, simulations=48)
+    with pytest.warns() as said:
+        (turn,) = loop
+    texts = [str(warning.message) for warning in said]
+    assert any("of 48 simulations are not finite: left out" in text for text in texts)
+    assert any("of 24 rows of a training batch hold NaN" in text for text in texts)
+    assert 0 < turn.fit.dropped < 48
+    assert turn.fit.pairs == 48 - turn.fit.dropped
+    dropped = [entry.get("dropped", 0) for entry in turn.curve]
+    assert [len(batch) for batch in learner.batches] == [24 - count for count in dropped]
+    assert sum(dropped) > 0
+    for batch in learner.batches:
+        assert batch["next", "observation"].isfinite().all()
+        assert (batch["theta"] > 0.5).all()
+    assert turn.frames == 24 * 10 * len(turn.curve)
 
 
 # Keeping work.

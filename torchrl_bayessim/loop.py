@@ -32,6 +32,7 @@ from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
 from . import checkpoint
+from .diverged import finite_rows
 from .errors import message
 from .evidence import Evidence, EvidenceSimulator
 from .inference.fit import FitReport
@@ -81,7 +82,7 @@ class Round:
         simulations: Pairs that the fit used.
         frames: Environment frames that the learner has seen since the start.
         curve: One entry per update: ``frames``, ``return`` of the episodes that ended in the
-            batch (NaN if none did), and what the learner reports.
+            batch (NaN if none did), what the learner reports, and ``dropped`` rows that diverged.
         seconds: Wall time of the round.
     """
 
@@ -295,9 +296,14 @@ class SimToRealLoop:
         planned = self.rounds * (self.updates + 1)
         done = state["round"] * (self.updates + 1) + len(state["curve"])
         key = (self.seed, "round", state["round"], "update", len(state["curve"]))
-        reported = self.learner.update(batch, key=key, progress=done / planned)
+        seen = [*self.learner.policy.in_keys, "reward"]
+        following = [("next", *([k] if isinstance(k, str) else k)) for k in seen]
+        usable, dropped = finite_rows(batch, [*seen, *following])
+        reported = self.learner.update(usable, key=key, progress=done / planned)
         state["frames"] += batch.numel()
-        entry = {"frames": float(state["frames"]), "return": ended_return(batch), **reported}
+        entry = {"frames": float(state["frames"]), "return": ended_return(usable), **reported}
+        if dropped:
+            entry["dropped"] = float(dropped)
         state["curve"] = [*state["curve"], entry]
 
     # Keeping work.

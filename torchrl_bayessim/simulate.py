@@ -20,6 +20,7 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
+from .diverged import UndisturbedPolicy
 from .errors import PhysicsError, SimulationError, message
 from .randomness import isolated, seed_from
 from .sources import Grid, draw
@@ -82,7 +83,12 @@ class ReplayActions(TensorDictModuleBase):
 
 
 def make_collector(env: EnvBase, policy: TensorDictModuleBase | None, *, steps: int) -> Collector:
-    """Return a collector of batches of ``steps`` steps of each environment."""
+    """Return a collector of batches of ``steps`` steps of each environment.
+
+    The policy goes on where a simulation diverges: see :mod:`.diverged`.
+    """
+    if isinstance(policy, TensorDictModuleBase):
+        policy = UndisturbedPolicy(policy)
     with isolated("collector"):  # it tries out the policy
         return Collector(
             env,
