@@ -39,6 +39,13 @@ def test_a_line_has_median_spread_ratios_seed_threads_and_versions(measuring, ca
         measuring.report("b", "c", [1.0], threads=2)
 
 
+@pytest.mark.parametrize("given", ["runs=x", "runs=0", "runs=-1", "runs=1.5", "runs="])
+def test_options_are_whole_positive_numbers(measuring, given):
+    with pytest.raises(SystemExit, match=r"expected runs= a whole number from 1 on, got '"):
+        measuring.options([given], runs=7)
+    assert measuring.options(["sbi=0"], optional=["sbi"], sbi=10, runs=7) == {"sbi": 0, "runs": 7}
+
+
 def test_misspelt_options_are_refused():
     """In a process of its own: a benchmark imports its neighbours as scripts do."""
     for script in ("batched_mujoco", "replay"):

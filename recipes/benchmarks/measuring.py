@@ -7,7 +7,7 @@ import os
 import platform
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 
 __all__ = ["compare", "options", "report"]
@@ -18,12 +18,18 @@ PACKAGES = (
 )  # fmt: skip
 
 
-def options(arguments: list[str], **defaults: int) -> dict[str, int]:
-    """Return ``name=value`` arguments over their defaults."""
+def options(
+    arguments: list[str], *, optional: Sequence[str] = (), **defaults: int
+) -> dict[str, int]:
+    """Return ``name=value`` arguments over their defaults: positive, or 0 where ``optional``."""
     given = {key: value for key, _, value in (a.partition("=") for a in arguments)}
     unknown = given.keys() - defaults
     if unknown:
         raise SystemExit(f"expected options {sorted(defaults)}, got {sorted(unknown)}")
+    for name, value in given.items():
+        least = 0 if name in optional else 1
+        if not value.isdecimal() or int(value) < least:
+            raise SystemExit(f"expected {name}= a whole number from {least} on, got {value!r}")
     return defaults | {name: int(value) for name, value in given.items()}
 
 

@@ -119,7 +119,7 @@ def measure(case: str, method: Callable[[int], LogDensity], seeds: int) -> None:
 
 def main(*arguments: str) -> None:
     """Measure every correction, then sbi."""
-    given = options(list(arguments), seeds=100, simulations=2000, sbi=10)
+    given = options(list(arguments), optional=["sbi"], seeds=100, simulations=2000, sbi=10)
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")  # the counts of repairs, which the tests read
     for correction in CORRECTIONS:
