@@ -705,7 +705,19 @@ def test_without_a_file_there_is_nothing_to_resume(tmp_path):
         ({"env": make_env(7)}, "made with environments=7, got 6"),
         (
             {"env": make_env(prior=BoxPrior({"length": (0.2, 1.6)}))},
-            r"made with refinement.prior='BoxPrior\(length: \[0.2, 1.6\]\)', got .*\[0.2, 1.5\]",
+            r"made with refinement.prior=.*'high': \[1.6.*\], .*got .*'high': \[1.5\]",
+        ),
+        (
+            {"env": make_env(prior=BoxPrior({"length": (0.2, 1.5002)}))},
+            r"made with refinement.prior=.*'high': \[1.5002.*\], .*got .*'high': \[1.5\]",
+        ),
+        (
+            {
+                "robot": SurrogateRobot(
+                    TransformedEnv(CartPoleEnv(2), physics()), [0.7], max_steps=10
+                )
+            },
+            "made with robot.parameters=",
         ),
     ],
     ids=lambda value: value if isinstance(value, str) else None,
@@ -718,6 +730,18 @@ def test_a_checkpoint_of_other_settings_is_refused(option, text, tmp_path):
     other = make_loop(*env, checkpoint_file=file, **option)
     with pytest.raises(ValueError, match=f"{text}.*Try: the settings of the run that wrote it"):
         other.resume()
+
+
+def test_a_checkpoint_of_something_else_is_refused(tmp_path):
+    checkpoint.save(tmp_path / "state.pt", {"loop": {}, "policy": {}})
+    with pytest.raises(ValueError, match=r"state of a loop, with an entry, got \"none 'learner'\""):
+        make_loop(checkpoint_file=tmp_path / "state.pt").resume()
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.5])
+def test_a_share_of_prior_draws_is_a_probability(share):
+    with pytest.raises(ValueError, match=f"prior_share to be a probability, 0 to 1, got {share}"):
+        make_loop(prior_share=share)
 
 
 RUN = """

@@ -182,6 +182,19 @@ def test_empty_logs_are_refused():
         RecordedLogs(logs.set("mask", logs["mask"] & torch.tensor([[True], [False]])))
     with pytest.raises(ValueError, match=r"trajectories \[n, T\].*got \(3,\)"):
         RecordedLogs(logs[0])
+    with pytest.raises(ValueError, match=r"trajectories \[n, T\].*got \(0, 3\)"):
+        RecordedLogs(logs[:0])
+
+
+def test_robots_and_logs_tell_themselves_from_others():
+    one, same, other = (SurrogateRobot(batched(), [t], max_steps=5) for t in (0.4, 0.4, 0.4001))
+    assert one.settings == same.settings != other.settings
+    assert "0.4" not in repr(other.settings)
+    assert one.settings != SurrogateRobot(batched(), [0.4], max_steps=6).settings
+    logs = [pad([log(3)]), pad([log(3)]), pad([log(4)])]
+    first, again, longer = (RecordedLogs(rows).settings for rows in logs)
+    assert (first == again) == torch.equal(logs[0]["action"], logs[1]["action"])
+    assert first == RecordedLogs(logs[0].clone()).settings != longer
 
 
 @pytest.mark.parametrize("steps", [0, -1])

@@ -99,6 +99,10 @@ class Round:
 class SimToRealLoop:
     """Rounds of inference and learning; iterate over it, and stop when you like.
 
+    A round counts as done when the next one is asked for, so that a run which is killed while its
+    caller works with a round yields it again. So does a second ``for`` after a ``break``: the round
+    in which the first was left comes again, as it was; nothing is computed twice.
+
     Args:
         env: Simulated environments, batch size ``[N]``, with ``randomizer`` among their
             transforms. With recorded logs it needs a ``StepCounter``.
@@ -160,6 +164,8 @@ class SimToRealLoop:
         for name, value in {"updates": updates, "shared_batches": shared_batches}.items():
             if value < 0:
                 raise ValueError(message(f"{name} not to be negative", value))
+        if not 0 <= prior_share <= 1:
+            raise ValueError(message("prior_share to be a probability, 0 to 1", prior_share))
         self.settings |= {
             "updates": updates,
             "shared_batches": shared_batches,
@@ -167,8 +173,8 @@ class SimToRealLoop:
             "seed": seed,
             "statistics": repr(statistics),
         }
-        learning: dict[str, Any] = getattr(learner, "settings", {})
-        for part, settings in {"refinement": refinement.settings, "learner": learning}.items():
+        for part, owner in {"refinement": refinement, "learner": learner, "robot": robot}.items():
+            settings: dict[str, Any] = getattr(owner, "settings", {})
             self.settings |= {f"{part}.{name}": value for name, value in settings.items()}
         self.learner, self.robot = learner, robot
         self.refinement, self.statistics, self.randomizer = refinement, statistics, randomizer
@@ -322,8 +328,12 @@ class SimToRealLoop:
         """Go on from a state, to the numbers of the unbroken run.
 
         Raises:
-            ValueError: If the state was made with other settings.
+            ValueError: If the state was made with other settings, or is not a loop's.
         """
+        missing = [name for name in self.state_dict() if name not in state]
+        if missing:
+            expected = "the state of a loop, with an entry"
+            raise ValueError(message(expected, f"none {missing[0]!r}", available=state))
         for name, value in self.settings.items():
             if state["settings"].get(name) != value:
                 raise ValueError(

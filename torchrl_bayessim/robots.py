@@ -10,6 +10,7 @@ from __future__ import annotations
 __all__ = ["RealSystem", "RecordedLogs", "SurrogateRobot", "comparable"]
 
 from collections.abc import Sequence
+from hashlib import blake2b
 from typing import Any, Protocol
 
 import torch
@@ -28,6 +29,8 @@ from .transforms.domain_randomizer import DomainRandomizer
 
 class RealSystem(Protocol):
     """What the loop asks of a robot.
+
+    If it has ``settings``, a dictionary of plain values, a checkpoint of others is refused.
 
     Attributes:
         recorded: Whether the answer is always the same log; the loop then replays its actions.
@@ -86,6 +89,7 @@ class SurrogateRobot:
         _check_not_randomized(env)
         self.max_steps, self.measured = max_steps, list(measured)
         theta = torch.as_tensor(theta, dtype=torch.float32)
+        self._theta = theta
         self._randomizer = DomainRandomizer(Grid(theta[None]))
         self._env = TransformedEnv(env, self._randomizer, auto_unwrap=False)
         self._observed = list(self._env.observation_spec.keys(include_nested=True))
@@ -94,6 +98,15 @@ class SurrogateRobot:
                 raise ValueError(
                     message("an observation to measure", entry, available=self._observed)
                 )
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What tells this robot from others, without giving its parameters away."""
+        return {
+            "parameters": _digest(self._theta),
+            "max_steps": self.max_steps,
+            "measured": [repr(entry) for entry in self.measured],
+        }
 
     @torch.no_grad()
     def rollouts(
@@ -138,6 +151,11 @@ def _check_not_randomized(env: EnvBase) -> None:
                 )
             )
         env = env.base_env
+
+
+def _digest(*tensors: Tensor) -> str:
+    content = [(str(t.dtype), t.detach().cpu().tolist()) for t in tensors]
+    return blake2b(repr(content).encode(), digest_size=8).hexdigest()
 
 
 def _next(entry: NestedKey) -> NestedKey:
@@ -195,7 +213,8 @@ class RecordedLogs:
                 raise ValueError(
                     message("logs with an entry", str(name), available=found, hint=hint)
                 )
-        if trajectories.ndim != 2 or not trajectories.get("mask").any(-1).all():
+        whole = trajectories.ndim == 2 and len(trajectories) > 0
+        if not whole or not trajectories.get("mask").any(-1).all():
             raise ValueError(
                 message(
                     "trajectories [n, T] of at least one step each", tuple(trajectories.batch_size)
@@ -203,6 +222,12 @@ class RecordedLogs:
             )
         self._check_finite(trajectories)
         self.trajectories = trajectories
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What tells these logs from others."""
+        entries = ("observation", "action", ("next", "observation"), "mask")
+        return {"logs": _digest(*(self.trajectories.get(entry) for entry in entries))}
 
     @staticmethod
     def _check_finite(trajectories: TensorDictBase) -> None:

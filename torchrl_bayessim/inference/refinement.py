@@ -85,7 +85,7 @@ class PosteriorRefinement:
     def settings(self) -> dict[str, Any]:
         """What refinements depend on besides their data; a loop refuses a checkpoint of others."""
         return {
-            "prior": repr(self.prior),
+            "prior": self.prior.settings,
             "simulations": self.simulations,
             "networks": self.networks,
             "make_posterior": getattr(self.make_posterior, "__qualname__", ""),
