@@ -27,6 +27,16 @@ def test_friction_of_table_and_object_is_felt(task):
     assert len(env.reset()["theta"].unique()) == 2  # it draws again
 
 
+def test_what_the_user_pinned_stays_pinned():
+    prior = BoxPrior({"LINK_MASS_1": (0.5, 1.5)})
+    randomizer = DomainRandomizer(prior)
+    physics = ApplyPhysics(AttributePhysics("LINK_MASS_1"))
+    env = TransformedEnv(AcrobotEnv(2, max_steps=100), Compose(physics, randomizer))
+    randomizer.pin([0.75])
+    check_influence(env, randomizer, prior, steps=20)
+    assert (env.reset()["theta"] == 0.75).all()
+
+
 def test_friction_that_the_table_overrules_is_refused():
     prior = BoxPrior({"friction": (0.1, 1.0)})
     with pytest.raises(PhysicsError, match=r"'friction' to change what is observed.*set both"):

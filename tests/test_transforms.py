@@ -338,7 +338,10 @@ def test_bad_theta_is_refused():
         env.reset(TensorDict(theta=torch.tensor([0.5])))
     randomizer = DomainRandomizer(Uniform())
     env = with_randomizer(randomizer)
-    randomizer.pin([1.0, 2.0, 3.0])
+    for wrong in ([1.0, 2.0, 3.0], [1.0, torch.nan], 1.0):
+        with pytest.raises(ValueError, match=r"finite numbers to pin, one for each .*'length'"):
+            randomizer.pin(wrong)
+    randomizer.pin([[1.0, 2.0]] * 3)
     with pytest.raises(ValueError, match="pinned θ of shape"):
         env.reset()
     randomizer = DomainRandomizer(Empirical([[1.0]]))

@@ -47,6 +47,7 @@ def check_influence(
         >>> env = TransformedEnv(CartPoleEnv(4), Compose(physics, randomizer))
         >>> check_influence(env, randomizer, prior, steps=10)
     """
+    pinned = randomizer.pinned
     middle = (prior.low + prior.high) / 2
     keys = [key for key in env.observation_spec.keys() if key != randomizer.key]  # noqa: SIM118
     try:
@@ -71,3 +72,5 @@ def check_influence(
                 )
     finally:
         randomizer.unpin()
+        if pinned is not None:
+            randomizer.pin(pinned)

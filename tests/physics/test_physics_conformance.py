@@ -143,3 +143,10 @@ def test_wrong_adapters_are_caught(wrong):
             Tests().test_writes_are_absolute()
         with pytest.raises(AssertionError, match="restoring nominal values"):
             Tests().test_nominal_values_can_be_restored()
+
+
+@pytest.mark.parametrize("low", [(0.1,), (0.1, 0.1, 0.1)])
+def test_every_parameter_needs_its_bounds(low):
+    physics = AttributePhysics("length", "masspole")
+    with pytest.raises(ValueError, match=rf"low and high for each of .*{len(low)} and 2 bounds"):
+        unused_parameters(lambda: CartPoleEnv(2), physics, low, (1.0, 1.0))

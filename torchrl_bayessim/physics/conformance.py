@@ -56,6 +56,7 @@ def unused_parameters(
         seed: Of the environment and of random actions.
 
     Raises:
+        ValueError: There are not as many bounds as parameters.
         SimulationError: The same seed, parameters and actions gave two different rollouts.
 
     Example:
@@ -67,6 +68,9 @@ def unused_parameters(
         ...     unused_parameters(lambda: GymEnv("Acrobot-v1"), physics, (0.5, 0.5), (2, 1.5))
         ('LINK_LENGTH_2',)
     """
+    if not len(low) == len(high) == len(physics.names):
+        expected = f"low and high for each of {physics.names}"
+        raise ValueError(message(expected, f"{len(low)} and {len(high)} bounds"))
     env = make_env()
     bottom, top = torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
     draws = generator(seed, "others")

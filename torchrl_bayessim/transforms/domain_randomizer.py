@@ -109,12 +109,18 @@ class DomainRandomizer(Transform):
 
         Raises:
             TypeError: θ is not a tensor nor numbers.
+            ValueError: θ is not finite, or of another length; at a reset, of another batch.
         """
+        expected = "numbers to pin, one for each parameter"
         try:
-            self._shared["pinned"] = torch.as_tensor(theta, dtype=torch.float32)
+            theta = torch.as_tensor(theta, dtype=torch.float32)
         except (TypeError, ValueError):
-            expected = "numbers to pin, one for each parameter"
             raise TypeError(message(expected, theta, hint=f"the order {self.names}")) from None
+        columns = theta.shape[-1:] if self.names is None else (len(self.names),)
+        if not theta.ndim or theta.shape[-1:] != columns or not theta.isfinite().all():
+            expected = f"{expected} of {self.names}" if self.names else expected
+            raise ValueError(message(f"finite {expected}", theta.tolist()))
+        self._shared["pinned"] = theta
 
     @property
     def pinned(self) -> Tensor | None:
