@@ -32,6 +32,7 @@ from torchrl_bayessim.agents.ppo import PPO
 from torchrl_bayessim.errors import message
 from torchrl_bayessim.evaluation import evaluate
 from torchrl_bayessim.inference.refinement import PosteriorRefinement
+from torchrl_bayessim.influence import without_influence
 from torchrl_bayessim.loop import SimToRealLoop, ended_return
 from torchrl_bayessim.randomness import isolated
 from torchrl_bayessim.robots import SurrogateRobot
@@ -74,6 +75,8 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
     loop, learner = make_loop(task, truth, settings, out)
     done = Journal(out / "rounds.json", resume=loop.resume() if settings.resume else False)
     print(f"{settings.task}: {task.prior}")
+    for name in idle(task):
+        print(f"note: {name} changes nothing that is observed, so no data can tell it")
     with Baseline(settings, frames=loop.planned_frames) as baseline:
         for turn in loop:
             earned = confidence(score(learner.policy))
@@ -147,6 +150,13 @@ def make_loop(
         progress=settings.progress,
     )
     return loop, learner
+
+
+def idle(task: Task) -> tuple[str, ...]:
+    """Return the parameters that change nothing in the simulator: their posterior is the prior."""
+    randomizer = DomainRandomizer(task.prior)
+    env = task.make(4, seed=0, randomizer=randomizer)
+    return without_influence(env, randomizer, task.prior, steps=min(100, task.horizon))
 
 
 class Score:

@@ -122,6 +122,17 @@ def test_killed_in_mid_run_it_resumes_to_the_same_result(finished, tmp_path):
     assert without_times(found) == without_times(expected)
 
 
+@pytest.mark.parametrize(
+    ("task", "expected"),
+    [("cartpole", ()), ("acrobot", ("LINK_LENGTH_2",)), ("hopper", ()), ("mountain_car", ())],
+)
+def test_parameters_that_change_nothing_are_told(task, expected, monkeypatch):
+    monkeypatch.syspath_prepend(RECIPE.parent)
+    import sim2real_ppo
+
+    assert sim2real_ppo.idle(sim2real_ppo.TASKS[task]) == expected
+
+
 def test_bad_settings_end_in_one_line_and_status_2(tmp_path):
     status, out, err = run("taks=pendulum", folder=tmp_path)
     assert status == 2

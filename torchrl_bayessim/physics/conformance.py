@@ -25,6 +25,7 @@ from torchrl.envs import EnvBase
 from ..errors import SimulationError, message
 from ..randomness import generator, isolated
 from .protocol import Physics
+from .unused import differ, unused
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -80,26 +81,21 @@ def unused_parameters(
     def replay(theta: Tensor) -> dict[str, Tensor]:
         return _replay(env, physics, theta, (actions, seed))
 
-    if _differ(replay(others[0]), replay(others[0])):
+    if differ(replay(others[0]), replay(others[0])):
         expected = f"the same rollout from the same seed, parameters and actions ({seed=})"
         hint = "does set_seed reach everything random in the environment?"
         raise SimulationError(message(expected, "two that differ", hint=hint))
-    unused = []
-    for i, name in enumerate(physics.names):
-        at = torch.arange(len(bottom)) == i
-        ends = ((torch.where(at, bottom, o), torch.where(at, top, o)) for o in others)
-        if not any(_differ(replay(one), replay(two)) for one, two in ends):
-            unused.append(name)
-    if unused:
+    found = unused(physics.names, (bottom, top), others, replay)
+    if found:
         warnings.warn(
-            f"{', '.join(unused)}: {len(actions)} steps are exactly the same from the lower bound "
+            f"{', '.join(found)}: {len(actions)} steps are exactly the same from the lower bound "
             "to the upper. Nothing can be learnt about a parameter without effect; is it hidden "
             "(MuJoCo takes the maximum of two frictions), unused by the simulator, or did the "
             "actions not reach what it acts on?",
             stacklevel=2,
         )
     env.close(raise_if_closed=False)
-    return tuple(unused)
+    return found
 
 
 class PhysicsTests:
@@ -141,7 +137,7 @@ class PhysicsTests:
         first = _replay(env, self.physics, one, (actions, 0))
         for theta in (one, one, two, one):
             again = _replay(env, self.physics, theta, (actions, 0))
-        assert not _differ(first, again), "writing other values in between changed the rollout"
+        assert not differ(first, again), "writing other values in between changed the rollout"
 
     def test_nominal_values_can_be_restored(self) -> None:
         """What was read before the first write undoes every write."""
@@ -152,7 +148,7 @@ class PhysicsTests:
         first = _replay(env, self.physics, nominal, (actions, 0))
         _start(env, self.physics, self._thetas(1)[0])
         again = _replay(env, self.physics, nominal, (actions, 0))
-        assert not _differ(first, again), "restoring nominal values did not restore the rollout"
+        assert not differ(first, again), "restoring nominal values did not restore the rollout"
 
     def test_environments_are_independent(self) -> None:
         """Writing one environment leaves another alone."""
@@ -165,8 +161,8 @@ class PhysicsTests:
     def test_every_parameter_has_an_effect(self) -> None:
         """Only those in ``unused`` change nothing."""
         with warnings.catch_warnings(action="ignore"):
-            unused = unused_parameters(self.make_env, self.physics, self.low, self.high)
-        assert set(unused) == set(self.unused)
+            found = unused_parameters(self.make_env, self.physics, self.low, self.high)
+        assert set(found) == set(self.unused)
 
     def _thetas(self, count: int) -> Tensor:
         low, high = torch.tensor(self.low), torch.tensor(self.high)
@@ -203,7 +199,10 @@ def _record(
 def _replay(
     env: EnvBase, physics: Physics, theta: Tensor, how: tuple[list[Tensor], int]
 ) -> dict[str, Tensor]:
-    """Return all entries that the environment gives, shape ``(T, *)``, under given actions."""
+    """Return what changes in time, shape ``(T, *)``, under given actions.
+
+    Constant entries are left out: they only repeat the parameters.
+    """
     actions, seed = how
     env.set_seed(seed)
     path = []
@@ -215,15 +214,8 @@ def _replay(
             td = env.step_mdp(td)
             if td["done"].any():
                 break
-    return dict(torch.stack(path).items())
-
-
-def _differ(one: dict[str, Tensor], two: dict[str, Tensor]) -> bool:
-    """Tell rollouts apart by what changes in time; constants only repeat the parameters."""
-    if len(one["done"]) != len(two["done"]):
-        return True
-    moving = [key for key in one if (one[key] != one[key][:1]).any()]
-    return any(not torch.equal(one[key], two[key]) for key in moving)
+    entries = torch.stack(path).items()
+    return {str(key): value for key, value in entries if (value != value[:1]).any()}
 
 
 def _assert_held(env: EnvBase, physics: Physics, theta: Tensor, td: TensorDictBase) -> None:
