@@ -16,6 +16,7 @@ import os
 import threading
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from importlib.util import find_spec
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from typing import Any
@@ -68,8 +69,7 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
         settings.updates = settings.updates or 2
     truth = true_parameters(task, settings.truth, seed=settings.seed)
     score = Score(task, truth, episodes=16 if settings.short else 100)
-    if settings.logger not in LOGGERS:
-        raise ValueError(message("a logger", settings.logger, available=LOGGERS))
+    check_logger(settings.logger)
     logger = get_logger(settings.logger, logger_name=str(out), experiment_name="log")
 
     loop, learner = make_loop(task, truth, settings, out)
@@ -107,6 +107,15 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
     draw_pictures(out, task, posterior, result=result, curves=curves, score="return")
     print(f"Pictures and numbers are in {out}")
     return result
+
+
+def check_logger(name: str) -> None:
+    """Refuse a logger that there is not, or whose package is not installed."""
+    if name not in LOGGERS:
+        raise ValueError(message("a logger", name, available=LOGGERS))
+    if name != "csv" and find_spec(name) is None:
+        expected = f"the package of logger={name} to be installed"
+        raise ValueError(message(expected, "none", hint=f"pip install {name}"))
 
 
 def chosen(settings: Sim2Real) -> Task:

@@ -197,6 +197,14 @@ def test_a_folder_that_holds_a_run_is_not_taken_for_another(finished, refused):
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.parametrize("logger", ["wandb", "mlflow", "tensorboard"])
+def test_a_logger_without_its_package_is_refused(logger, refused, monkeypatch):
+    import sim2real_ppo
+
+    monkeypatch.setattr(sim2real_ppo, "find_spec", lambda name: None)
+    assert f"Try: pip install {logger}" in refused(f"logger={logger}")
+
+
 @pytest.mark.parametrize("debug", ["true", "True", "yes", "1"])
 def test_debug_shows_the_traceback_however_it_is_spelt(debug, refused, monkeypatch):
     import recipe
