@@ -17,6 +17,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
 from torchrl_bayessim.errors import PhysicsError
+from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.physics.attributes import AttributePhysics
 from torchrl_bayessim.sources import Empirical, Grid
 from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
@@ -373,7 +374,12 @@ def test_a_simulator_that_does_not_hold_what_was_written_is_an_error():
 def test_repr_names_parameters_and_units():
     env = with_randomizer(DomainRandomizer(Uniform()))
     assert "masspole [kg], length [m]" in repr(env.transform[0])
-    assert "Uniform, names=('masspole', 'length')" in repr(env.transform[1])
+    assert "Uniform, names=('masspole', 'length'), units=None" in repr(env.transform[1])
+    assert env.transform[0].units == ("kg", "m")
+    prior = BoxPrior({"masspole": (0.2, 1.0), "length": (0.3, 1.5)}, units={"length": "m"})
+    env.transform[1].source = prior
+    assert env.transform[1].units == ("", "m")
+    assert "BoxPrior, names=('masspole', 'length'), units=('', 'm')" in repr(env.transform[1])
 
 
 def test_real_rollouts_of_one_parameter_differ():

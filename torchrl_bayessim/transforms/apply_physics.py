@@ -21,6 +21,9 @@ from .resets import resets, simulator
 class ApplyPhysics(Transform):
     """Writes the θ that a reset brings, and checks that the simulator holds it afterwards.
 
+    θ is an observation like others, float32 of shape ``(*batch, D)``: column i is ``names[i]`` in
+    ``units[i]``, which the representation of the environment shows.
+
     A reset without θ restores the nominal values: those in force when the environment was first
     wrapped. The entry ``key`` of every reset is what the simulator itself says, read back after
     its own reset, and is carried through the episode.
@@ -42,6 +45,8 @@ class ApplyPhysics(Transform):
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), ApplyPhysics(AttributePhysics("m", "l")))
         >>> env.reset()["theta"]
         tensor([1., 1.])
+        >>> list(zip(env.transform.names, env.transform.units))
+        [('m', 'kg'), ('l', 'm')]
     """
 
     def __init__(self, physics: Physics, *, key: NestedKey = "theta") -> None:
@@ -57,6 +62,11 @@ class ApplyPhysics(Transform):
     def names(self) -> tuple[str, ...]:
         """The parameters' names, in the order of the columns of θ."""
         return tuple(self.physics.names)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The units of the columns of θ, ``""`` where they are not known."""
+        return tuple(getattr(self.physics, "units", ("",) * len(self.names)))
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Attach to the simulator, and note its nominal values."""
@@ -162,6 +172,6 @@ class ApplyPhysics(Transform):
         return next_tensordict.set(self.key, theta)
 
     def __repr__(self) -> str:
-        units = getattr(self.physics, "units", ("",) * len(self.names))
-        named = ", ".join(f"{n} [{u}]" if u else n for n, u in zip(self.names, units, strict=True))
+        rows = zip(self.names, self.units, strict=True)
+        named = ", ".join(f"{name} [{unit}]" if unit else name for name, unit in rows)
         return f"ApplyPhysics({type(self.physics).__name__}({named}), key={self.key!r})"

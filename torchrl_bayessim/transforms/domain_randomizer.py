@@ -15,11 +15,10 @@ from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform, Transformed
 
 from ..episode_draws import EpisodeDraws
 from ..errors import PhysicsError, message
-from ..randomness import seed_from
 from ..remote_source import PolicyWithSource
 from ..sources import Empirical, Grid, Source, names_of
 from .resets import resets, simulator
-from .workers import in_worker, note_seeds, noted_seed
+from .workers import first_of_worker, in_worker, note_seeds
 
 
 class DomainRandomizer(Transform):
@@ -101,6 +100,11 @@ class DomainRandomizer(Transform):
     def names(self) -> tuple[str, ...] | None:
         """The parameters' names, in the order of the columns of θ, if known."""
         return self._shared["names"]
+
+    @property
+    def units(self) -> tuple[str, ...] | None:
+        """Their units, as the source says; None if it does not."""
+        return getattr(self.source, "units", None)
 
     def pin(self, theta: Any) -> None:
         """Give every environment this θ, of shape ``(D,)`` or ``(*batch, D)``, until `unpin`.
@@ -242,15 +246,7 @@ class DomainRandomizer(Transform):
         if collector is not None or not in_worker():
             worker = None if collector is None else collector.worker_idx
             return (worker or 0) * len(self._theta)
-        seed = noted_seed(simulator(self.parent))
-        if seed is None or isinstance(self.source, Grid):
-            expected = "what tells the workers of a batched environment apart"
-            got = "a Grid, which goes by their numbers" if seed is not None else "no seed yet"
-            outside = "TransformedEnv(SerialEnv(n, make), DomainRandomizer(source))"
-            hint = f"the randomizer outside, {outside}, or "
-            hint += "first_environment=" if seed is not None else "env.set_seed(0) before the reset"
-            raise PhysicsError(message(expected, got, hint=hint))
-        return seed_from(seed, "worker") % 2**48
+        return first_of_worker(simulator(self.parent), numbered=isinstance(self.source, Grid))
 
     def _receive(self) -> None:
         """Take over a table that `push_source` has sent since the last reset."""
@@ -294,5 +290,5 @@ class DomainRandomizer(Transform):
         self.source = self.source
 
     def __repr__(self) -> str:
-        source = type(self.source).__name__
-        return f"DomainRandomizer({source}, names={self.names}, key={self.key!r})"
+        options = f"names={self.names}, units={self.units}, key={self.key!r}"
+        return f"DomainRandomizer({type(self.source).__name__}, {options})"

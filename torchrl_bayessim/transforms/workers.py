@@ -7,11 +7,14 @@ the first worker, a seed derived from it to the second, and so on.
 
 from __future__ import annotations
 
-__all__ = ["in_worker", "note_seeds", "noted_seed"]
+__all__ = ["first_of_worker", "in_worker", "note_seeds"]
 
 import sys
 from functools import partial
 from typing import Any
+
+from ..errors import PhysicsError, message
+from ..randomness import seed_from
 
 _BATCHED = ("torchrl.envs.batched_envs", "torchrl.envs.async_envs")
 
@@ -23,9 +26,21 @@ def note_seeds(env: Any) -> None:
         env.__dict__["set_seed"] = partial(_set_seed, env)
 
 
-def noted_seed(env: Any) -> int | None:
-    """Return the seed of the last ``set_seed`` of a simulator, None before."""
-    return env.__dict__.get("_noted_seed")
+def first_of_worker(env: Any, *, numbered: bool) -> int:
+    """Return a number for the first environment of a worker, made from its simulator's seed.
+
+    Raises:
+        PhysicsError: There has been no seed; or the numbers have to run from 0, ``numbered``.
+    """
+    seed = env.__dict__.get("_noted_seed")
+    if seed is None or numbered:
+        expected = "what tells the workers of a batched environment apart"
+        got = "no seed yet" if seed is None else "a Grid, which goes by their numbers"
+        outside = "TransformedEnv(SerialEnv(n, make), DomainRandomizer(source))"
+        other = "env.set_seed(0) before the reset" if seed is None else "first_environment="
+        hint = f"the randomizer outside, {outside}, or {other}"
+        raise PhysicsError(message(expected, got, hint=hint))
+    return seed_from(seed, "worker") % 2**48
 
 
 def in_worker() -> bool:
