@@ -366,6 +366,7 @@ class Bringing:
 
     def __init__(self, change):
         self.robot, self.change = make_robot(), change
+        self.settings = self.robot.settings
 
     def rollouts(self, policy, **options):
         return self.change(self.robot.rollouts(policy, **options))

@@ -5,6 +5,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector
 from torchrl.envs import Compose, GymEnv, SerialEnv, StepCounter, Transform, TransformedEnv
 
 from torchrl_bayessim.agents.ppo import PPO
@@ -15,7 +16,13 @@ from torchrl_bayessim.errors import PhysicsError, SimulationError
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.physics.attributes import AttributePhysics
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
-from torchrl_bayessim.simulate import ReplayActions, collect_summaries, make_collector, simulate
+from torchrl_bayessim.simulate import (
+    ReplayActions,
+    collect_summaries,
+    make_collector,
+    next_batch,
+    simulate,
+)
 from torchrl_bayessim.sources import draw
 from torchrl_bayessim.summaries import SummaryStatistics, duration, linear_dynamics, moments
 from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
@@ -222,21 +229,36 @@ def test_actions_that_cannot_be_replayed_are_refused():
         ReplayActions(torch.full((1, 4, 2), torch.nan))
 
 
-def test_a_simulator_that_hands_nan_to_the_policy_is_named():
-    class Diverging(Transform):
-        def _step(self, tensordict, next_tensordict):
-            far = next_tensordict["observation"].abs().sum(-1, keepdim=True) > 0.5
-            observation = next_tensordict["observation"].masked_fill(far, torch.nan)
-            return next_tensordict.set("observation", observation)
+class Diverging(Transform):
+    def _step(self, tensordict, next_tensordict):
+        far = next_tensordict["observation"].abs().sum(-1, keepdim=True) > 0.5
+        observation = next_tensordict["observation"].masked_fill(far, torch.nan)
+        return next_tensordict.set("observation", observation)
 
-    prior = BoxPrior({"length": (0.1, 2.0)})
-    randomizer = DomainRandomizer(prior)
+
+def diverging():
+    randomizer = DomainRandomizer(BoxPrior({"length": (0.1, 2.0)}))
     physics = ApplyPhysics(AttributePhysics("length"))
     env = TransformedEnv(CartPoleEnv(8), Compose(physics, randomizer, Diverging()))
-    policy = PPO(env).policy
+    return env, randomizer, PPO(env).policy
+
+
+def test_a_simulation_that_gives_nan_has_no_summary_and_stops_no_other():
+    env, randomizer, policy = diverging()
     statistics = SummaryStatistics(linear_dynamics)
+    pairs = simulate(env, policy, statistics, randomizer, pairs=16, max_steps=4, progress=False)
+    good = pairs["summary"].isfinite().all(-1)
+    assert 0 < good.sum() < 16
+    assert pairs["summary"][~good].isnan().all()
+
+
+def test_nan_that_ends_a_collector_is_named():
+    env, _, policy = diverging()
+    options = {"total_frames": -1, "auto_register_policy_transforms": False}
+    collector = Collector(env, policy, frames_per_batch=8 * 60, **options)
     with pytest.raises(SimulationError, match="does a simulation diverge"):
-        simulate(env, policy, statistics, randomizer, pairs=8, max_steps=60, progress=False)
+        next_batch(collector)
+    collector.shutdown()
 
 
 @pytest.mark.parametrize("name", ["pairs", "max_steps", "trajectories"])
