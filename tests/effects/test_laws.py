@@ -80,13 +80,18 @@ def test_a_drive_that_follows_within_the_step_acts_by_its_mean():
     values = changed("action_lag", half, 0, 1, 1, 1, held=False)
     assert values == pytest.approx([0, mean, 1 - (1 - mean) / 2, 1 - (1 - mean) / 4])
     assert changed("action_lag", 0.0, 0, 1, 2, held=False) == [0, 1, 2]
-    assert effect("action_lag").forms() == (effect("action_lag"), effect("action_lag", held=False))
+    assert effect("action_lag").forms(9.0) == (
+        effect("action_lag"),
+        effect("action_lag", held=False),
+    )
 
 
 def test_a_battery_loses_no_more_than_half_again_of_its_sag():
     values = changed("battery_sag", 0.4, *[1.0] * 40, seconds=1.0)
     assert values[10] == pytest.approx(0.6)
     assert values[20] == values[-1] == pytest.approx(0.4)
+    runs = [effect("battery_sag").forms(seconds)[0].seconds for seconds in (4.0, 60.0)]
+    assert runs == [4.0, 10.0]
 
 
 def test_lost_packets_and_samples_repeat_the_last_that_arrived():

@@ -25,6 +25,7 @@ from .chance import chances, detectable, of_chance
 from .evidence import assemble
 from .holds import bridged
 from .objective import Unit, pushes_of, units_of
+from .onsets import with_onsets
 from .preparation import Prepared, prepare
 from .report import Report
 from .scatter import Scatter, gap_with_holds
@@ -64,7 +65,7 @@ def diagnose(
     """
     begun = time.perf_counter()
     system = _system(simulator, prior)
-    chosen = _effects(system, effects)
+    chosen = _effects(system, effects, logs)
     every = units_of(chosen, system.robot)
     units = [unit for unit in every if not unit.effect.random]
     generator = np.random.default_rng(seed)
@@ -74,6 +75,7 @@ def diagnose(
         bridges, holds = bridged(logs, system.robot) if _asks_for_holds(every) else (logs, [])
         prepared = prepare(system, bridges, units, generator=generator, horizon=horizon)
         units = _with_shapes(system, prepared, units)
+        units = with_onsets(prepared.sets["train"], prepared.nominal.point, units)
         selection = select(
             prepared.sets["train"],
             prepared.sets["validation"],
@@ -139,8 +141,11 @@ def _system(simulator: str | Task | System, prior: BoxPrior | None) -> System:
     return System(task=task, physics=physics, prior=prior)
 
 
-def _effects(system: System, effects: Sequence[str | Effect] | None) -> list[Effect]:
+def _effects(
+    system: System, effects: Sequence[str | Effect] | None, logs: Sequence[Log]
+) -> list[Effect]:
     if effects is None:
         effects = list(CATALOGUE) if system.effects is None else system.effects
-    forms = [effect(e).forms() if isinstance(e, str) else (e,) for e in effects]
+    seconds = max((len(log) for log in logs), default=1) * system.control_dt
+    forms = [effect(e).forms(seconds) if isinstance(e, str) else (e,) for e in effects]
     return [form for some in forms for form in some]

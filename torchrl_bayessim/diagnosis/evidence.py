@@ -6,6 +6,7 @@ __all__ = ["assemble"]
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -149,10 +150,13 @@ def assemble(
     )
 
 
+_UNTESTED = 0.2  # of an effect's range that does nothing in these data
+
+
 def _not_excited(selection: Selection, candidates: Sequence[Candidate]) -> list[Unit]:
     """Return the units of effects that the data could have shown nowhere, at all targets first."""
     excited = {c.name for c in candidates if c.status != "not_excited"}
-    units = dict.fromkeys(selection.screens[0].units)
+    units = dict.fromkeys(replace(u, onset=0.0) for u in selection.screens[0].units)
     return sorted((u for u in units if u.name not in excited), key=lambda u: u.where != "all")
 
 
@@ -191,7 +195,7 @@ def _credit(selection: Selection) -> dict[str, float]:
 def _strength_errors(fit: Fit, dispersion: float, size: int) -> dict[Unit, float]:
     covariance = fit.covariance(dispersion)
     deviations = np.sqrt(np.maximum(np.diag(covariance)[size:], 0.0))
-    return {u: float(d * u.high) for u, d in zip(fit.units, deviations, strict=True)}
+    return {u: float(d * (u.high - u.onset)) for u, d in zip(fit.units, deviations, strict=True)}
 
 
 def _effects(
@@ -204,7 +208,7 @@ def _effects(
     found = []
     for name in dict.fromkeys(u.name for u in best.units):
         units = [u for u in best.units if u.name == name]
-        strengths = [best.fit.point.strengths[u] for u in units]
+        strengths = [u.actual(best.fit.point.strengths[u]) for u in units]
         mean = float(np.mean(strengths))
         error = float(np.sqrt(np.sum([errors[u] ** 2 for u in units])) / len(units))
         found.append(
@@ -243,8 +247,9 @@ def _candidates(
         if forms[str(unit)] is not unit:
             continue
         model, ci, gain = fitted.get(unit), None, None
+        strength = unit.actual(strength)  # noqa: PLW2901
         if model is not None:
-            strength = model.fit.point.strengths[unit]  # noqa: PLW2901 - the fit knows better
+            strength = unit.actual(model.fit.point.strengths[unit])  # noqa: PLW2901 - knows better
             error = _strength_errors(model.fit, model.dispersion(), len(model.fit.point.z))[unit]
             ci = (strength - 1.96 * error, strength + 1.96 * error)
             before = float((selection.nominal.validation**2).sum())
@@ -261,7 +266,7 @@ def _candidates(
                 held_out_gain=gain,
                 explained_fraction=float(np.clip(ratio * growth[unit] / excess, 0.0, 1.0)),
                 explained_by_parameters=swallowed[unit],
-                minimal_detectable_strength=least if np.isfinite(least) else None,
+                minimal_detectable_strength=unit.actual(least) if np.isfinite(least) else None,
                 status=_status(
                     unit,
                     used,
@@ -288,7 +293,7 @@ def _status(
         return "named"
     if unit.name in confused or inside > 0.98:
         return "confounded"
-    if not np.isfinite(least) or least > unit.high:
+    if not np.isfinite(least) or least > unit.high or unit.onset > _UNTESTED * unit.high:
         return "not_excited"
     return "rejected" if ratio > 12 else "ruled_out"
 

@@ -44,6 +44,8 @@ class Unit:
         direction: Strength of each target per strength of the unit, shape ``(N,)``.
         low: Lowest plausible strength, zero or negative.
         high: Highest plausible strength.
+        onset: Largest strength that does nothing in these data. Searches and fits count from there:
+            see `actual`.
     """
 
     effect: Effect
@@ -51,6 +53,7 @@ class Unit:
     direction: tuple[float, ...]
     low: float
     high: float
+    onset: float = 0.0
 
     @property
     def name(self) -> str:
@@ -64,6 +67,10 @@ class Unit:
         """
         reach = 1.0 if self.effect.unit == "fraction" else 2.0
         return float(np.clip(strength, reach * self.low, reach * self.high))
+
+    def actual(self, strength: float) -> float:
+        """Return the effect's own strength: ``onset + strength (1 - onset / high)``, 0 for 0."""
+        return self.onset + strength * (1 - self.onset / self.high) if strength else 0.0
 
     def joint(self, robot: Robot) -> int:
         """Return the joint at which it acts, -1 where there is none or there are several."""
@@ -135,9 +142,8 @@ class Objective:
         """The number of coordinates ``D + 1``."""
         return 1 + (0 if self.prior is None else len(self.prior.names))
 
-    def thinned(self, every: int) -> Objective:
-        """Return the objective on every so many segments."""
-        index = np.arange(0, len(self.segments), every)
+    def take(self, index: NDArray[np.int64]) -> Objective:
+        """Return the objective on some segments."""
         return Objective(
             self.predictor, self.prior, self.segments.take(index), self.whitening.take(index)
         )
@@ -174,5 +180,5 @@ def strengths_of(points: Sequence[Point], robot: Robot) -> Strengths:
             if unit.effect not in result:
                 count = len(unit.effect.targets(robot))
                 result[unit.effect] = np.zeros((len(points), count))
-            result[unit.effect][p] += strength * np.array(unit.direction)
+            result[unit.effect][p] += unit.actual(strength) * np.array(unit.direction)
     return result

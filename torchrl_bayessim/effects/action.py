@@ -102,8 +102,9 @@ class ActionLag(ActionEffect):
     def __init__(self, *, held: bool = True) -> None:
         self.held = held
 
-    def forms(self) -> tuple[Effect, ...]:
+    def forms(self, seconds: float) -> tuple[Effect, ...]:
         """Return the controller's and the drive's."""
+        del seconds
         return ActionLag(held=True), ActionLag(held=False)
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
@@ -153,14 +154,15 @@ class DeadBand(ActionEffect):
 class Saturation(ActionEffect):
     """Strong commands are cut: ``clip(u, ±(1 − s) u_max)``, where ``u_max`` bounds commands.
 
-    A fraction, 0 to 0.8.
+    A fraction, 0 to 0.9.
     """
 
     name, unit, group, memoryless = "saturation", "fraction", "gain", True
+    limit = True
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
-        """Return 0 and 0.8."""
-        return within(torch.ones_like(robot.command_scale), 0.0, 0.8)
+        """Return 0 and 0.9."""
+        return within(torch.ones_like(robot.command_scale), 0.0, 0.9)
 
     def command(
         self, action: Tensor, strength: Tensor, memory: Memory, now: Now
@@ -215,6 +217,10 @@ class BatterySag(ActionEffect):
 
     def __init__(self, seconds: float = 10.0) -> None:
         self.seconds = seconds
+
+    def forms(self, seconds: float) -> tuple[Effect, ...]:
+        """Return what is lost within the runs, if they are shorter than ``T``."""
+        return (BatterySag(min(seconds, self.seconds)),)
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.6."""

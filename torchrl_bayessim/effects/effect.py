@@ -71,6 +71,7 @@ class Effect(ABC):
         channel: Where it sits: ``sensing``, ``actuation``, ``body`` or ``contact``.
         random: Whether it changes the distribution of what is seen rather than its mean.
         memoryless: Whether the law depends on this step only, so that sequences are one call.
+        limit: Whether a small strength does nothing to a robot that stays far from the limit.
     """
 
     name: ClassVar[str]
@@ -79,6 +80,7 @@ class Effect(ABC):
     channel: ClassVar[str]
     random: ClassVar[bool] = False
     memoryless: ClassVar[bool] = False
+    limit: ClassVar[bool] = False
 
     def __eq__(self, other: object) -> bool:
         """Return whether the other is the same law with the same options."""
@@ -96,8 +98,13 @@ class Effect(ABC):
         del robot
         return self
 
-    def forms(self) -> tuple[Effect, ...]:
-        """Return the laws that go by this name: a diagnosis that is given the name tries all."""
+    def forms(self, seconds: float) -> tuple[Effect, ...]:
+        """Return the laws that go by this name: a diagnosis that is given the name tries all.
+
+        Args:
+            seconds: How long runs are.
+        """
+        del seconds
         return (self,)
 
     @abstractmethod

@@ -96,15 +96,17 @@ class TorqueSpeedLimit(_Transmission):
 
     Where it drives (``F v > 0``); ``F_max`` is the actuator's largest force and ``v_max`` the
     joint's velocity scale.
-    A number from 0 to 1.2: the straight line of a DC motor between stall and no load.
+    A number from 0 to 6: the straight line of a DC motor between stall and no load. A model does
+    not tell how fast its motors are; 1.2 is as fast as the velocity scale, 6 a fifth of that.
     """
 
     name, unit, group = "torque_speed_limit", "fraction", "gain"
+    limit = True
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
-        """Return 0 and 1.2."""
+        """Return 0 and 6."""
         one = torch.ones(len(robot.actuators), dtype=torch.float64)
-        return 0.0 * one, 1.2 * one
+        return 0.0 * one, 6.0 * one
 
     def forces(
         self, strength: Tensor, memory: Memory, now: Now
