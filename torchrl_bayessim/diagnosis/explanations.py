@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..effects.robot import Robot
 from .additions import groups, pairs, singles
@@ -23,7 +24,7 @@ from .screening import Screen, screen
 
 _PROMISING = 24  # explanations that are fitted on some segments
 _SURVIVORS, _FINALISTS = 7, 4  # that are fitted on all segments, and to the end
-_MANY, _APART, _MATTER = 150, 4, 8  # units, targets of one effect, effects to look at singly
+_MANY, _APART, _MATTER = 400, 4, 8  # units, targets of one effect, effects to look at singly
 _FEW, _EVERY = 8, 4  # segments on which a round begins at least, and which share at least
 _BENT = 5.0  # mean squared innovation of a nominal fit that may have gone astray
 _PLAIN = 300.0  # misfit beyond noise with which a few segments tell explanations apart
@@ -40,14 +41,14 @@ class Round:
         seen: All units, those that matter on all segments.
         thin: Some of the segments.
         coarse: All units on those.
-        every: Every so many segments are among them.
+        index: Which.
     """
 
     base: Fit
     seen: Screen
     thin: Objective
     coarse: Screen
-    every: int
+    index: NDArray[np.int64]
 
 
 def compare(train: Objective, base: Fit, units: Sequence[Unit], *, glance: bool = False) -> Round:
@@ -61,21 +62,23 @@ def compare(train: Objective, base: Fit, units: Sequence[Unit], *, glance: bool 
     """
     coarser = 2 if glance else 1
     every = int(np.clip(round(coarser * len(train.segments) / _FEW), 1, coarser * _EVERY))
-    thin, fit = train.thinned(every), base.thinned(every)
+    index = base.spread(every)
+    thin, fit = train.take(index), base.take(index)
     if len(units) > _MANY:  # single ones only of the effects that matter
         counts = Counter(unit.name for unit in units)
         whole = [u for u in units if u.where == "all" or counts[u.name] <= _APART]
-        best = screen(thin.thinned(2), fit.thinned(2), whole).best(1.0)
+        half = fit.spread(2)
+        best = screen(thin.take(half), fit.take(half), whole).best(1.0)
         names = list(dict.fromkeys(unit.name for unit in best))[:_MATTER]
         units = [u for u in units if u in whole or u.name in names]
     coarse = screen(thin, fit, units)
     if glance or every == 1 or _plain(fit):
-        return Round(base, coarse.grown(every), thin, coarse, every)
+        return Round(base, coarse.grown(every), thin, coarse, index)
     first = list(coarse.best(1.0))[:_MATTER]
     together = [unit for on in [*pairs(coarse), *groups(coarse)] for unit in on]
     picks = list(dict.fromkeys([*first, *together]))
     fine = screen(train, base, picks)
-    return Round(base, fine.joined(coarse, every), thin, coarse, every)
+    return Round(base, fine.joined(coarse, every), thin, coarse, index)
 
 
 def explanations(train: Objective, now: Round) -> list[Fit]:
@@ -99,7 +102,7 @@ def explanations(train: Objective, now: Round) -> list[Fit]:
         for point in _spread(fit, train.predictor.system.robot)
     ]
     tried += refit(now.thin, everywhere, iterations=3, renew=False)
-    if _plain(base.thinned(now.every)):
+    if _plain(base.take(now.index)):
         best = _fittest(tried, _FINALISTS, alike=1)
         return refit(train, [fit.point for fit in best], race=np.inf)
     starts = [fit.point for fit in _fittest(tried, _SURVIVORS)]
@@ -117,7 +120,7 @@ def _starts(now: Round) -> tuple[list[Point], list[Fit | None]]:
     """Return where to begin, and points near there whose derivatives are known."""
     base, seen = now.base, now.seen
     additions = [*singles(seen), *pairs(seen), *groups(seen)]
-    thin = base.thinned(now.every)
+    thin = base.take(now.index)
     starts = [Point(base.point.z, {**base.point.strengths, **on}) for on in additions]
     origins = [now.coarse.origin(thin, list(on)) for on in additions]
     if base.units or len(base.point.z) == 1 or not bent(base):

@@ -50,11 +50,19 @@ class Fit:
         """The misfit and what the prior adds, ``‖z‖²``."""
         return self.misfit + float((self.point.z**2).sum())
 
-    def thinned(self, every: int) -> Fit:
-        """Return what the fit is on every so many segments."""
+    def spread(self, every: int) -> NDArray[np.int64]:
+        """Return every so many segments, from the worst explained one to the best.
+
+        So those that alone show something are among them, and the rest as often as it occurs.
+        """
+        order = np.argsort(-(self.innovations**2).sum(-1), kind="stable")
+        return np.sort(order[::every])
+
+    def take(self, index: NDArray[np.int64]) -> Fit:
+        """Return what the fit is on some segments."""
         segments, size = len(self.innovations), self.jacobian.shape[1]
-        jacobian = self.jacobian.reshape(segments, -1, size)[::every].reshape(-1, size)
-        return Fit(self.point, self.units, self.innovations[::every], jacobian)
+        jacobian = self.jacobian.reshape(segments, -1, size)[index].reshape(-1, size)
+        return Fit(self.point, self.units, self.innovations[index], jacobian)
 
     def beside(self, unit: Unit) -> Fit:
         """Return the fit with one more unit at zero, of which nothing is known yet."""
