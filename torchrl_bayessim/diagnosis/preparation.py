@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ..errors import message
@@ -32,6 +33,7 @@ _ROWS = {"train": 900, "validation": 600, "test": 600}  # control steps simulate
 _FEWEST = 12  # rows of a run
 _PROBE = 100  # control steps on which horizons are compared
 _FEW = 8  # segments on which the parameters are fitted first
+_DEAL = "train", "test", "validation", "train", "train", "validation", "test", "train"
 _WORTH = 0.2  # nats per effect that a longer horizon must bring
 
 
@@ -68,17 +70,15 @@ class Prepared:
 def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
     """Return training, validation and test logs.
 
-    From the longest to the shortest, of every four logs two train, one tests, one validates, so
-    that each split has some of the longest. Fewer than three logs are each divided in time: half, a
-    quarter, a quarter.
+    From those that show most to those that show least (rows, times how near commands and
+    velocities come to their largest), of every four logs the first and last train, one tests, one
+    validates: what acts in the widest motion only should act in each split. Fewer than three logs
+    are each divided in time: half, a quarter, a quarter.
     """
     if len(logs) >= 3:
-        order = ("train", "test", "train", "validation")
         parts: dict[str, list[Log]] = {"train": [], "validation": [], "test": []}
-        for i, log in enumerate(sorted(logs, key=len, reverse=True)):
-            parts[order[i % 4]].append(log)
-        if not parts["validation"]:
-            parts["validation"].append(parts["train"].pop())
+        for i, at in enumerate(np.argsort(-_shown(logs), kind="stable")):
+            parts[_DEAL[i % len(_DEAL)]].append(logs[at])
         return parts
     parts = {"train": [], "validation": [], "test": []}
     for log in logs:
@@ -87,6 +87,13 @@ def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
         for name, begin, end in zip(parts, ends, ends[1:], strict=False):
             parts[name].append(_rows(log, begin, end))
     return parts
+
+
+def _shown(logs: Sequence[Log]) -> Array:
+    """Return each log's rows, times the mean of its peaks as shares of the largest ones."""
+    peaks = np.array([torch.cat([log.ctrl, log.qvel], 1).abs().amax(0).numpy() for log in logs])
+    shares = peaks / np.maximum(peaks.max(0), 1e-12)
+    return np.array([len(log) for log in logs]) * shares.mean(1)
 
 
 def _rows(log: Log, begin: int, end: int) -> Log:
