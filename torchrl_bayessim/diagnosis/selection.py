@@ -11,7 +11,7 @@ from __future__ import annotations
 
 __all__ = ["Model", "Selection", "as_good", "parts", "select"]
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +36,7 @@ _WRONG = 1.5  # mean squared innovation of a base that something is missing from
 _MOST = 4  # effects in one explanation
 _APART = 3  # effects without each of which a model is fitted with derivatives of its own
 _ALIKE = 4  # models with an effect of the same group in its place
+_EXCHANGES = 3  # searches for others in the place of an effect
 _RIVALS = 6  # models with another effect in the place of one
 
 
@@ -131,14 +132,29 @@ def select(
     progress("taking out what is not needed")
     best, dropped = _eliminated(train, validation, best)
     tried += dropped
-    alternatives = {}
-    if best.units:
+    alternatives: dict[str, tuple[Model, ...]] = {}
+    for _ in range(_EXCHANGES):
+        if not best.units:
+            break
         progress("trying others in its place")
         alternatives = _alternatives(
             train, validation, best, units=units, tried=tried, first=screens[0]
         )
         tried += [model for models in alternatives.values() for model in models]
+        better = _exchanged(best, alternatives)
+        if better is best:
+            break
+        best, dropped = _eliminated(train, validation, _exactly(train, validation, better))
+        tried += dropped
     return Selection(start, best, tuple(screens), tuple(p_values), tuple(tried), alternatives)
+
+
+def _exchanged(best: Model, alternatives: Mapping[str, Sequence[Model]]) -> Model:
+    """Return the best of a model and its alternatives, itself unless chance is unlikely."""
+    others = [model for models in alternatives.values() for model in models]
+    first = min([best, *others], key=lambda m: _criterion(m, best.dispersion()))
+    gain = _criterion(best, best.dispersion()) - _criterion(first, best.dispersion())
+    return first if gain > _LIKELY else best
 
 
 def _all_explained(start: Model, best: Model) -> bool:
