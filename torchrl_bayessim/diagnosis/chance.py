@@ -39,6 +39,7 @@ _WHITE = 1.15  # mean squared innovation of a model that leaves nothing to chanc
 _CALM = 1.3  # φ beyond which an effect of chance has not explained the scatter
 _SEGMENTS = 8  # of each split
 _APART = 4  # targets of one effect that are looked at singly
+_SURE = 2.5  # standard errors of segments by which the mean gain exceeds zero
 _NEEDED, _LIKELY = 20.0, 6.0  # deviances: to be found, and that chance often makes
 
 
@@ -73,7 +74,7 @@ class _Data:
     def of(cls, objective: Objective, point: Point) -> _Data:
         """Return the data of a split, on some segments."""
         every = max(1, len(objective.segments) // _SEGMENTS)
-        some = objective.thinned(every)
+        some = objective.take(np.arange(0, len(objective.segments), every))
         fit = refit(some, [Point(point.z)], iterations=0)[0]
         weights = some.whitening.weights[:, None]
         derivatives = fit.jacobian.reshape(*fit.innovations.shape, -1) / weights[..., None]
@@ -106,11 +107,16 @@ class _Data:
 
 @dataclass(frozen=True, eq=False)
 class _Told:
-    """What the judged segments say of a point: ``δ``, the deviance, the largest ``φ``."""
+    """What the judged segments say of a point: ``δ``, their deviances, the largest ``φ``."""
 
     change: Array
-    cost: float
+    costs: Array
     scatter: float
+
+    @property
+    def cost(self) -> float:
+        """The deviance of all."""
+        return float(self.costs.sum())
 
 
 def of_chance(units: Sequence[Unit]) -> list[Unit]:
@@ -163,7 +169,7 @@ def chances(
     for (unit, strength), one in zip(rows, told, strict=True):
         best[unit] = min(best.get(unit, (np.inf, 0.0)), (one.cost, strength))
     least = min(cost for cost, _ in best.values())
-    if base - least < _NEEDED:
+    if base.sum() - least < _NEEDED:
         return []
     found = [
         _refined(judged, sets["test"], unit, strength, point=point, base=base)
@@ -183,11 +189,13 @@ def _calm(selection: Selection) -> bool:
     return max(float((best.fit.innovations**2).mean()), best.dispersion()) < _WHITE
 
 
-def _without(judged: Sequence[_Data], point: Point) -> float:
-    """Return the deviance of an explanation without chance, of evenly spread scatter."""
-    left = [data.innovations([point])[0] for data in judged]
-    squares, count = sum(float((r**2).sum()) for r in left), sum(r.size for r in left)
-    return min(squares / phi + count * np.log(phi) for phi in _SCATTER)
+def _without(judged: Sequence[_Data], point: Point) -> Array:
+    """Return deviances of an explanation without chance, of evenly spread scatter, by segment."""
+    left = [(data.innovations([point])[0] ** 2) for data in judged]
+    squares = np.concatenate([r.sum(-1) for r in left])
+    size = np.concatenate([np.full(len(r), r.shape[1]) for r in left])
+    costs = squares / _SCATTER[:, None] + size * np.log(_SCATTER)[:, None]
+    return np.asarray(costs[costs.sum(1).argmin()])
 
 
 def _told(judged: Sequence[_Data], points: Sequence[Point]) -> list[_Told]:
@@ -196,7 +204,8 @@ def _told(judged: Sequence[_Data], points: Sequence[Point]) -> list[_Told]:
     for p in range(len(points)):
         change = _change(judged[0], drawn[0][p])
         found = [_deviance(data, d[p], change) for data, d in zip(judged, drawn, strict=True)]
-        told.append(_Told(change, sum(c for c, _, _ in found), max(phi for _, phi, _ in found)))
+        costs = np.concatenate([cost for cost, _, _ in found])
+        told.append(_Told(change, costs, max(phi for _, phi, _ in found)))
     return told
 
 
@@ -224,20 +233,20 @@ def _spectrum(drawn: Array) -> tuple[Array, Array]:
     return roots**2, vectors
 
 
-def _deviance(data: _Data, drawn: Array, change: Array) -> tuple[float, float, Any]:
-    """Return the least deviance over ``φ``, that ``φ``, and mean squares for ``φ = 1``, (S,)."""
+def _deviance(data: _Data, drawn: Array, change: Array) -> tuple[Array, float, Array]:
+    """Return least deviances over ``φ``, that ``φ``, and mean squares for ``φ = 1``, ``(S,)``."""
     values, vectors = _spectrum(drawn)
     error = data.left + drawn.mean(0) + data.derivatives @ change
     inside = np.einsum("srm,sm->sr", vectors, error) ** 2
     beside = np.maximum((error**2).sum(-1) - inside.sum(-1), 0.0)
     free = error.shape[1] - values.shape[1]
     costs = [
-        float((inside / (phi + values) + np.log(phi + values)).sum())
-        + float((beside / phi + free * np.log(phi)).sum())
+        (inside / (phi + values) + np.log(phi + values)).sum(-1)
+        + (beside / phi + free * np.log(phi))
         for phi in _SCATTER
     ]
     standard = ((inside / (1 + values)).sum(-1) + beside) / error.shape[1]
-    best = int(np.argmin(costs))
+    best = int(np.argmin([cost.sum() for cost in costs]))
     return costs[best], float(_SCATTER[best]), standard.astype(np.float64)
 
 
@@ -248,16 +257,21 @@ def _refined(
     strength: float,
     *,
     point: Point,
-    base: float,
+    base: Array,
 ) -> Chance | None:
-    """Return the effect at its likeliest strength, nothing if it leaves more than noise."""
+    """Return the effect at its likeliest strength, nothing if it leaves more than noise.
+
+    Nor if it explains a few segments only: what chance does, it does everywhere.
+    """
     strengths = np.array([1.0, *_AROUND]) * strength
     strengths = np.unique(np.minimum(strengths, unit.high))
     points = [Point(point.z, {unit: float(s)}) for s in strengths]
     told = _told(judged, points)
     costs = np.array([one.cost for one in told])
     best = int(np.argmin(costs))
-    if told[best].scatter > _CALM:
+    gains = base - told[best].costs
+    everywhere = gains.mean() > _SURE * gains.std(ddof=1) / np.sqrt(len(gains))
+    if told[best].scatter > _CALM or not everywhere:
         return None
     unseen = _Data.of(test, point)
     after = _deviance(unseen, unseen.draws([points[best]])[0], told[best].change)[2]
@@ -265,7 +279,7 @@ def _refined(
         unit=unit,
         strength=float(strengths[best]),
         error=_error(np.log(strengths), costs) * float(strengths[best]),
-        gain=base - float(costs[best]),
+        gain=float(gains.sum()),
         left=after,
     )
 
