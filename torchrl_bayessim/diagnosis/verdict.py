@@ -7,7 +7,7 @@ how much of it the effects explain, not only whether it is significant::
     named          effects explain at least 80 %, and what is left is not significant, or 2 %
     named_partial  effects explain at least 40 %; the rest is located
     ambiguous      effects of different kinds explain the data equally well
-    unknown        the gap is real, and the catalogue does not explain 40 % of it
+    unknown        the gap is real, and the catalogue explains less than 40 % of it, or perhaps none
     not_testable   the data are too few or too uniform to say
 """
 
@@ -65,7 +65,7 @@ def conclude(
     elif measured.refit - 1.0 <= _NEGLIGIBLE and measured.excess_ci[0] <= 0:
         # seen by the search, but too small to matter on the test runs
         verdict = "none" if not significant else "named_partial"
-    elif measured.explained < _PARTIAL:
+    elif measured.explained < _PARTIAL or measured.explained_ci[0] <= 0:
         verdict = "unknown"
     elif len(groups) > 1 and len(confused) > 1:
         verdict = "ambiguous"
@@ -126,9 +126,10 @@ def _sentence(
     if verdict == "unknown":
         best = max((c.explained_fraction for c in candidates), default=0.0)
         best = max(best, measured.explained)
-        text = (
-            f"{gap} It is real, but no effect of the catalogue explains more than {_percent(best)}."
-        )
+        found = f"no effect of the catalogue explains more than {_percent(best)}"
+        if best >= _PARTIAL:
+            found = "what could explain it on some runs does not hold on others"
+        text = f"{gap} It is real, but {found}."
         return f"{text}{place}{parameters}{untested}"
     causes = ", and ".join(_described(e) for e in effects)
     low, high = measured.explained_ci
