@@ -19,7 +19,6 @@ __all__ = ["Chance", "chances", "detectable", "of_chance"]
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
