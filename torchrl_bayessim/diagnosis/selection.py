@@ -151,7 +151,10 @@ def select(
 
 def _exchanged(best: Model, alternatives: Mapping[str, Sequence[Model]]) -> Model:
     """Return the best of a model and its alternatives, itself unless chance is unlikely."""
-    others = [model for models in alternatives.values() for model in models]
+    every = [model for models in alternatives.values() for model in models]
+    others = [
+        m for m in every if len(m.units) <= len(best.units) or _gain(best, m) > _needed(best, m)
+    ]
     first = min([best, *others], key=lambda m: _criterion(m, best.dispersion()))
     gain = _criterion(best, best.dispersion()) - _criterion(first, best.dispersion())
     return first if gain > _LIKELY else best
@@ -225,7 +228,23 @@ def _chosen(base: Model, models: Sequence[Model]) -> Model | None:
     better = [m for m in models if _gain(base, m) > _needed(base, m)]
     if not better:
         return None
-    return min(better, key=lambda m: _criterion(m, dispersion))
+    first = min(better, key=lambda m: _criterion(m, dispersion))
+    return min([first, *_coarser(first, better)], key=lambda m: len(m.units))
+
+
+def _coarser(model: Model, models: Sequence[Model]) -> list[Model]:
+    """Return models of the same kinds of effects with fewer strengths, unless they predict worse.
+
+    One strength at all places may stand for one at each.
+    """
+    kinds = {unit.effect.group for unit in model.units}
+    return [
+        m
+        for m in models
+        if {u.effect.group for u in m.units} == kinds
+        and len(m.units) < len(model.units)
+        and _gain(m, model) <= _needed(m, model)
+    ]
 
 
 def _needed_only(
