@@ -5,7 +5,8 @@ how much of it the effects explain, not only whether it is significant::
 
     none           nothing significant, or an excess below 5 % of the noise floor
     named          effects explain at least 80 %, and what is left is not significant, or 2 %
-    named_partial  effects explain at least 40 %; the rest is located
+    named_partial  effects explain at least 40 %; the rest is located. Or 80 % on validation runs,
+                   where test runs hardly show the gap
     ambiguous      effects of different kinds explain the data equally well
     unknown        the gap is real, and the catalogue explains less than 40 % of it, or perhaps none
     not_testable   the data are too few or too uniform to say
@@ -28,6 +29,7 @@ from .shrinkage import Shrinkage
 
 _NEGLIGIBLE = 0.05  # of the noise floor: an excess that no one would chase
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
+_SHOWN = 1.2  # mean squared innovation of runs that show a gap
 _ALL, _NAMED, _PARTIAL = 0.98, 0.8, 0.4
 
 
@@ -54,6 +56,9 @@ def conclude(
               (selection.nominal.fit.innovations, selection.nominal.validation)]  # fmt: skip
     visible = measured.excess_ci[0] > 0 and min(measured.refit, *splits) > _UNEXPLAINED
     left = measured.remainder_ci[0] > _NEGLIGIBLE and measured.explained < _ALL
+    validated = _validated(selection)
+    unsaid = measured.explained < _PARTIAL or measured.explained_ci[0] <= 0
+    elsewhere = unsaid and _hardly_shown(measured) and validated >= _NAMED
     verdict: Verdict
     if not _excited(system, prepared):
         verdict = "not_testable"
@@ -65,8 +70,8 @@ def conclude(
     elif measured.refit - 1.0 <= _NEGLIGIBLE and measured.excess_ci[0] <= 0:
         # seen by the search, but too small to matter on the test runs
         verdict = "none" if not significant else "named_partial"
-    elif measured.explained < _PARTIAL or measured.explained_ci[0] <= 0:
-        verdict = "unknown"
+    elif unsaid:
+        verdict = "named_partial" if elsewhere else "unknown"
     elif len(groups) > 1 and len(confused) > 1:
         verdict = "ambiguous"
     elif measured.explained >= _NAMED and not left:
@@ -85,10 +90,28 @@ def conclude(
             effects=effects,
             candidates=candidates,
             confused=confused,
+            validated=validated if elsewhere else None,
             where=where,
         ),
         alarms,
     )
+
+
+def _hardly_shown(measured: Shrinkage) -> bool:
+    """Return whether test runs show so little of the gap that they cannot say what explains it."""
+    low, high = measured.explained_ci
+    return measured.refit < _SHOWN or (low <= 0 and high >= _NAMED)
+
+
+def _validated(selection: Selection) -> float:
+    """Return the share of the gap that the effects explain on validation runs, 0 if they have none.
+
+    They were chosen there too, so it flatters them.
+    """
+    before, after = (
+        float((model.validation**2).mean()) for model in (selection.nominal, selection.best)
+    )
+    return min((before - after) / (before - 1.0), 1.0) if before > _SHOWN else 0.0
 
 
 def _excited(system: System, prepared: Prepared) -> bool:
@@ -108,6 +131,7 @@ def _sentence(
     effects: Sequence[Finding],
     candidates: Sequence[Candidate],
     confused: Sequence[str],
+    validated: float | None,
     where: Mapping[str, Any],
 ) -> str:
     gap = f"Gap: {measured.refit:.3g} times the noise floor on {prepared.horizon}-step prediction."
@@ -134,6 +158,8 @@ def _sentence(
     causes = ", and ".join(_described(e) for e in effects)
     low, high = measured.explained_ci
     share = f"explains {_percent(measured.explained)} [{100 * low:.0f}, {100 * high:.0f}] of it"
+    if validated is not None:
+        share = f"explains {_percent(validated)} of it on validation runs, test runs hardly show it"
     if verdict == "ambiguous":
         others = ", ".join(confused)
         return (
@@ -141,7 +167,8 @@ def _sentence(
             f"{share}.{parameters}{untested}"
         )
     text = f"{gap} Cause: {causes}, {share}"
-    text += "." if verdict == "named" else f"; {_percent(1 - measured.explained)} remain."
+    partial = verdict != "named" and validated is None
+    text += f"; {_percent(1 - measured.explained)} remain." if partial else "."
     if len(confused) > 1:
         text += f" Not separable from: {', '.join(confused[1:])}."
     return f"{text}{parameters}{untested}"
