@@ -187,9 +187,12 @@ def test_friction_laws():
     at = pytest.approx
     assert forces("stribeck_friction", 2.0, qvel=0.2)["dof_frictionloss"] == at([2 / math.e] * 4)
     assert forces("quadratic_drag", 2.0, qvel=-3.0)["dof_damping"] == at([6.0] * 4)
-    assert forces("directional_friction", 2.0, qvel=1.0)["dof_frictionloss"] == [2.0] * 4
-    assert forces("directional_friction", 2.0, qvel=-1.0)["dof_frictionloss"] == [0.0] * 4
-    assert forces("directional_friction", -2.0, qvel=-1.0)["dof_frictionloss"] == [2.0] * 4
+    for strength in (2.0, -2.0):  # the sum is -s, or nothing, by the direction of motion
+        one = forces("directional_friction", strength)
+        along, helps = np.array(one["dof_frictionloss"]), np.array(one["qfrc_applied"])
+        against = np.sign(strength) * along
+        np.testing.assert_array_equal(helps - against, [-strength] * 4)
+        np.testing.assert_array_equal(helps + against, [0.0] * 4)
     # gear 2 at the shoulder, a servo of gain 5 that is 1 rad off, gear −1 at the rail
     loads = forces("load_dependent_friction", 0.5, ctrl=(1.5, 1.0, 4.0))["dof_frictionloss"]
     assert loads == at([1.5, 2.5, 2.0, 0.0])

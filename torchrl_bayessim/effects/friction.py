@@ -84,7 +84,8 @@ class LoadDependentFriction(ForceEffect):
 class DirectionalFriction(ForceEffect):
     """Dry friction ``|s|`` in one direction only: where ``v`` has the sign of ``s``.
 
-    N m or N, up to 30 % of ``F_max`` in either direction.
+    Half of it is dry friction in both directions, half a force that helps in the other: so what
+    sticks is held by as much as there is. N m or N, up to 30 % of ``F_max`` in either direction.
     """
 
     name, unit, group = "directional_friction", "N m", "friction"
@@ -97,5 +98,5 @@ class DirectionalFriction(ForceEffect):
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
         """Return the dry friction in this direction."""
-        along = strength * now.velocity > 0
-        return {"frictionloss": torch.where(along, strength.abs(), 0.0)}, memory
+        del now
+        return {"frictionloss": strength.abs() / 2, "force": -strength / 2}, memory
