@@ -10,6 +10,7 @@ __all__ = ["groups", "pairs", "singles"]
 import numpy as np
 from scipy.optimize import nnls
 
+from ..effects.effect import Effect
 from .objective import Unit
 from .screening import Screen
 
@@ -19,10 +20,10 @@ _PAIRS, _GROUPS = 4, 3  # at most
 def singles(seen: Screen) -> list[dict[Unit, float]]:
     """Return each effect at its best place, and at all of its targets together."""
     best = seen.best(1.0)
-    chosen: dict[tuple[str, bool], Unit] = {}
+    chosen: dict[tuple[Effect, bool], Unit] = {}
     for unit in best:
         if best[unit][0] > 2.0:
-            chosen.setdefault((unit.name, unit.where == "all"), unit)
+            chosen.setdefault((unit.effect, unit.where == "all"), unit)
     return [{unit: best[unit][1]} for unit in chosen.values()]
 
 
@@ -67,11 +68,11 @@ def groups(seen: Screen) -> list[dict[Unit, float]]:
     found = []
     usable = (seen.norms > 0) & (seen.growth == seen.growth.min(initial=np.inf))
     for name in dict.fromkeys(unit.name for unit in seen.units):
-        best: dict[Unit, int] = {}
+        best: dict[str, int] = {}  # by target: one law of the name at each
         for i, unit in enumerate(seen.units):
             if unit.name == name and unit.where != "all" and usable[i]:
-                known = best.get(unit)
-                best[unit] = i if known is None or seen.scores[i] > seen.scores[known] else known
+                known = best.setdefault(unit.where, i)
+                best[unit.where] = i if seen.scores[i] > seen.scores[known] else known
         if len(best) < 2:
             continue
         rows = list(best.values())
@@ -80,8 +81,8 @@ def groups(seen: Screen) -> list[dict[Unit, float]]:
         scores = seen.scores[rows]
         amplitude, _ = nnls((vectors * root).T, vectors.T @ scores / root)
         on = {
-            unit: unit.inside(float(a / seen.norms[i] * seen.strengths[i]))
-            for (unit, i), a in zip(best.items(), amplitude, strict=True)
+            seen.units[i]: seen.units[i].inside(float(a / seen.norms[i] * seen.strengths[i]))
+            for i, a in zip(rows, amplitude, strict=True)
             if a > 0
         }
         if len(on) > 1:

@@ -12,6 +12,8 @@ from ..effects.transmission import ServoDeadBand
 from .objective import Objective
 from .selection import Model, Selection, as_good, parts
 
+_FORM = 0.01  # of what an effect explains: how well the form of its law is known
+
 
 def confusion_set(selection: Selection, name: str) -> tuple[str, ...]:
     """Return the names of effects that explain the data as well as one of the best model's.
@@ -56,8 +58,25 @@ def _alike(one: Effect, other: Effect) -> bool:
 
 
 def rivals(selection: Selection, name: str) -> list[Model]:
-    """Return the models with another effect in the place of one that are as good as the best."""
-    return [m for m in selection.alternatives.get(name, ()) if as_good(selection.best, m)]
+    """Return the models with another effect in the place of one that are as good as the best.
+
+    Or nearly: effects of one group may be one cause that has neither's form, and no law is known
+    to the last percent of what it explains.
+    """
+    return [
+        m
+        for m in selection.alternatives.get(name, ())
+        if as_good(selection.best, m) or _another_form(selection, m, name)
+    ]
+
+
+def _another_form(selection: Selection, rival: Model, name: str) -> bool:
+    """Return whether a rival of the same group explains all but a percent of the same."""
+    best = selection.best
+    mine = {u.effect.group for u in best.units if u.name == name}
+    others = {u.effect.group for u in rival.units if u not in best.units}
+    none, left, more = (float(m.deviances().sum()) for m in (selection.nominal, best, rival))
+    return mine == others and more - left < _FORM * (none - left)
 
 
 def stand_in(selection: Selection, rival: Model) -> str:

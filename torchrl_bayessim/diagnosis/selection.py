@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from ..effects.effect import ForceEffect
+from ..effects.effect import Effect, ForceEffect
 from .explanations import bent, compare, explanations
 from .objective import Objective, Point, Unit
 from .refit import Fit, refit
@@ -354,16 +354,16 @@ def _alternatives(
         else:  # the search has tried those that stand out; what acts alike is a rival anyway
             base, most = start, _ALIKE
             groups = {u.effect.group for u in best.units}
-            seen = {name, *(u.name for m in known for u in m.units)}
+            seen = {u.effect for m in known for u in m.units}
             strongest = {
                 unit: found
                 for unit, found in first.best(1.0).items()
-                if unit.effect.group in groups and unit.name not in seen
+                if unit.effect.group in groups and unit.name != name and unit.effect not in seen
             }
-        additions: dict[str, dict[Unit, float]] = {}
+        additions: dict[Effect, dict[Unit, float]] = {}
         for unit, (_, strength) in strongest.items():
             if len(additions) < most:
-                additions.setdefault(unit.name, {unit: strength})
+                additions.setdefault(unit.effect, {unit: strength})
         known += _fitted(train, validation, base, list(additions.values()), race=best.fit.cost)
         result[name] = tuple(known)
     return result
