@@ -33,7 +33,9 @@ _ROWS = {"train": 900, "validation": 600, "test": 600}  # control steps simulate
 _FEWEST = 12  # rows of a run
 _PROBE = 100  # control steps on which horizons are compared
 _FEW = 8  # segments on which the parameters are fitted first
-_DEAL = "train", "test", "validation", "train", "train", "validation", "test", "train"
+_PIECE = 0.25  # of the median log's length, below which it is a piece of one
+_AS_LONG = 1.25  # ratio of two lengths that count as one
+_DEAL = "train", "test", "validation", "train", "train", "test", "validation", "train"
 _WORTH = 0.2  # nats per effect that a longer horizon must bring
 
 
@@ -70,15 +72,18 @@ class Prepared:
 def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
     """Return training, validation and test logs.
 
-    From those that show most to those that show least (rows, times how near commands and
-    velocities come to their largest), of every four logs the first and last train, one tests, one
-    validates: what acts in the widest motion only should act in each split. Fewer than three logs
-    are each divided in time: half, a quarter, a quarter.
+    From the longest to the shortest, and among those about as long from the widest motion to the
+    least, of every four logs the first and last train, one tests, one validates: what acts in wide
+    motion only should act in each split. Pieces that are much shorter than the others train: over
+    them no error grows. Fewer than three logs are each divided in time: half, a quarter, a quarter.
     """
-    if len(logs) >= 3:
+    typical = float(np.median([len(log) for log in logs])) if logs else 0.0
+    whole = [log for log in logs if len(log) >= _PIECE * typical]
+    if len(whole) >= 3:
         parts: dict[str, list[Log]] = {"train": [], "validation": [], "test": []}
-        for i, at in enumerate(np.argsort(-_shown(logs), kind="stable")):
-            parts[_DEAL[i % len(_DEAL)]].append(logs[at])
+        for i, log in enumerate(_ordered(whole)):
+            parts[_DEAL[i % len(_DEAL)]].append(log)
+        parts["train"] += [log for log in logs if len(log) < _PIECE * typical]
         return parts
     parts = {"train": [], "validation": [], "test": []}
     for log in logs:
@@ -89,11 +94,12 @@ def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
     return parts
 
 
-def _shown(logs: Sequence[Log]) -> Array:
-    """Return each log's rows, times the mean of its peaks as shares of the largest ones."""
+def _ordered(logs: Sequence[Log]) -> list[Log]:
+    """Return the longest first; of those about as long, what moves and commands most."""
     peaks = np.array([torch.cat([log.ctrl, log.qvel], 1).abs().amax(0).numpy() for log in logs])
-    shares = peaks / np.maximum(peaks.max(0), 1e-12)
-    return np.array([len(log) for log in logs]) * shares.mean(1)
+    width = (peaks / np.maximum(peaks.max(0), 1e-12)).mean(1)
+    length = np.round(np.log([len(log) for log in logs]) / np.log(_AS_LONG))
+    return [logs[at] for at in np.lexsort((-width, -length))]
 
 
 def _rows(log: Log, begin: int, end: int) -> Log:

@@ -57,7 +57,8 @@ def conclude(
     visible = measured.excess_ci[0] > 0 and min(measured.refit, *splits) > _UNEXPLAINED
     left = measured.remainder_ci[0] > _NEGLIGIBLE and measured.explained < _ALL
     validated = _validated(selection)
-    unsaid = measured.explained < _PARTIAL or measured.explained_ci[0] <= 0
+    perhaps_nothing = measured.explained_ci[0] <= 0 and validated < _PARTIAL
+    unsaid = measured.explained < _PARTIAL or perhaps_nothing
     elsewhere = unsaid and _hardly_shown(measured) and validated >= _NAMED
     verdict: Verdict
     if not _excited(system, prepared):
