@@ -22,6 +22,7 @@ from .objective import Objective, Point, Unit, parameters_at, pushes_of
 from .prediction import Predictor
 from .refit import Fit, refit
 from .segments import Segments, cut
+from .unseen import require_seen
 from .whitening import Whitening, innovation_noise, noise_from_differences, whitening
 
 Array = NDArray[np.float64]
@@ -32,6 +33,7 @@ _HISTORY = 0.4  # seconds of commands that delay lines and filters look back at
 _ROWS = {"train": 900, "validation": 600, "test": 600}  # control steps simulated per candidate
 _FEWEST = 12  # rows of a run
 _PROBE = 100  # control steps on which horizons are compared
+_STEPS = 20  # over which a joint that nobody measured would be seen
 _FEW = 8  # segments on which the parameters are fitted first
 _PIECE = 0.25  # of the median log's length, below which it is a piece of one
 _AS_LONG = 1.25  # ratio of two lengths that count as one
@@ -128,7 +130,7 @@ def prepare(
         horizon: Control steps per segment; default chosen.
 
     Raises:
-        ValueError: No log is long enough.
+        ValueError: No log is long enough, or a joint that matters was not logged.
     """
     if not logs:
         raise ValueError(message("logs", "none"))
@@ -146,6 +148,8 @@ def prepare(
         )
     history = min(max(8, round(_HISTORY / system.control_dt)), 100)
     noise, source = _noise(system, predictor, parts["train"], history=history, alarms=alarms)
+    some = cut(parts["train"], min(_STEPS, shortest // 2), history=history, most=_FEW)
+    require_seen(predictor, some, parameters_at(system.prior, _start(system)), noise)
     if horizon is None:
         horizon = _horizon(
             predictor, system, parts["train"], units=units, noise=noise, history=history
