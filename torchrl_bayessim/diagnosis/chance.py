@@ -31,6 +31,7 @@ from .selection import Selection
 
 Array = NDArray[np.float64]
 _DRAWS, _FEW = 12, 4  # simulations of each candidate, and of what is only to be ruled out
+_MANY = 60  # of what is named: a scatter that fewer do not span would count as left
 _LEVELS = (0.08, 0.2, 0.45, 1.0)  # of an effect's range
 _AROUND = (0.65, 0.8, 1.25, 1.55)  # times the best of these
 _SCATTER = np.geomspace(0.6, 4.0, 20)  # φ
@@ -38,7 +39,7 @@ _WHITE = 1.15  # mean squared innovation of a model that leaves nothing to chanc
 _CALM = 1.3  # φ beyond which an effect of chance has not explained the scatter
 _SEGMENTS = 8  # of each split
 _APART = 4  # targets of one effect that are looked at singly
-_SURE = 2.5  # standard errors of segments by which the mean gain exceeds zero
+_SURE = 1.5  # standard errors of segments by which the mean gain exceeds zero
 _NEEDED, _LIKELY = 20.0, 6.0  # deviances: to be found, and that chance often makes
 
 
@@ -273,7 +274,8 @@ def _refined(
     if told[best].scatter > _CALM or not everywhere:
         return None
     unseen = _Data.of(test, point)
-    after = _deviance(unseen, unseen.draws([points[best]])[0], told[best].change)[2]
+    drawn = unseen.draws([points[best]], _MANY)[0]
+    after = _deviance(unseen, drawn, told[best].change)[2]
     return Chance(
         unit=unit,
         strength=float(strengths[best]),
