@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from one_joint_arm import ARM, FRICTION
 
 from torchrl_bayessim.diagnosis.divergence import divergence_alarms
 from torchrl_bayessim.diagnosis.figures import figures
@@ -21,24 +22,11 @@ from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.system import System
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
 
-XML = """
-<mujoco>
-  <option timestep="0.005"/>
-  <worldbody>
-    <body name="link">
-      <joint name="hinge" axis="0 1 0" damping="0.02"/>
-      <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass=".5"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="motor" joint="hinge"/></actuator>
-</mujoco>
-"""
-FRICTION = 0.15  # N m
 NOISE = {"q": 0.001, "qd": 0.02}
 
 
 def arm():
-    model = mujoco.MjModel.from_xml_string(XML)
+    model = mujoco.MjModel.from_xml_string(ARM)
     columns = Columns("t", {"hinge": ("q",)}, {"hinge": ("qd",)}, {"motor": "tau"})
     return System(
         task=Task(model=model, frame_skip=2),
@@ -52,7 +40,7 @@ def arm():
 def logged(seed, rows=160):
     """Return a log of an arm with dry friction, driven by a sum of sines."""
     generator = np.random.default_rng(seed)
-    model = mujoco.MjModel.from_xml_string(XML)
+    model = mujoco.MjModel.from_xml_string(ARM)
     model.dof_frictionloss[:] = FRICTION
     data = mujoco.MjData(model)
     frequency, phase = generator.uniform(0.5, 3.0, 4), generator.uniform(0.0, 6.0, 4)

@@ -35,6 +35,7 @@ from .shrinkage import Shrinkage, shares, shrinkage
 from .verdict import conclude
 
 Array = NDArray[np.float64]
+_UNTESTED = 0.2  # of an effect's range that does nothing in these data
 
 
 def assemble(
@@ -148,9 +149,6 @@ def assemble(
         strengths=strengths if effects else {},
         figures=figures(prepared, selection, measured),
     )
-
-
-_UNTESTED = 0.2  # of an effect's range that does nothing in these data
 
 
 def _not_excited(selection: Selection, candidates: Sequence[Candidate]) -> list[Unit]:

@@ -79,15 +79,14 @@ def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
     motion only should act in each split. Pieces that are much shorter than the others train: over
     them no error grows. Fewer than three logs are each divided in time: half, a quarter, a quarter.
     """
-    typical = float(np.median([len(log) for log in logs])) if logs else 0.0
-    whole = [log for log in logs if len(log) >= _PIECE * typical]
+    parts: dict[str, list[Log]] = {"train": [], "validation": [], "test": []}
+    least = _PIECE * float(np.median([len(log) for log in logs])) if logs else 0.0
+    whole = [log for log in logs if len(log) >= least]
     if len(whole) >= 3:
-        parts: dict[str, list[Log]] = {"train": [], "validation": [], "test": []}
         for i, log in enumerate(_ordered(whole)):
             parts[_DEAL[i % len(_DEAL)]].append(log)
-        parts["train"] += [log for log in logs if len(log) < _PIECE * typical]
+        parts["train"] += [log for log in logs if len(log) < least]
         return parts
-    parts = {"train": [], "validation": [], "test": []}
     for log in logs:
         length = len(log)
         ends = 0, length // 2, 3 * length // 4, length
