@@ -9,8 +9,9 @@ from dataclasses import replace
 
 from ..effects.effect import Effect
 from ..effects.transmission import ServoDeadBand
+from .model import Model, as_good
 from .objective import Objective
-from .selection import Model, Selection, as_good, parts
+from .selection import Selection, parts
 
 _FORM = 0.01  # of what an effect explains: how well the form of its law is known
 

@@ -23,6 +23,7 @@ from .divergence import divergence_alarms
 from .experiment import experiments
 from .figures import figures
 from .location import location
+from .model import Model
 from .objective import Objective, Point, Unit, strengths_of
 from .preparation import Prepared
 from .refit import Fit
@@ -30,7 +31,7 @@ from .report import Candidate, Finding, Gap, Parameter, Report
 from .rollout import rollout_errors
 from .scatter import Scatter
 from .screening import Screen
-from .selection import Model, Selection
+from .selection import Selection
 from .shrinkage import Shrinkage, shares, shrinkage
 from .verdict import conclude
 

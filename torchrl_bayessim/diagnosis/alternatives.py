@@ -1,0 +1,89 @@
+"""Models with another effect in the place of one: what the data cannot tell from the best.
+
+The first search tries what stands out of a screen at the nominal fit. What acts alike, and what
+would do as well beside the effects that were found since, is fitted here.
+"""
+
+from __future__ import annotations
+
+__all__ = ["alternatives", "exchanged"]
+
+from collections.abc import Mapping, Sequence
+
+from ..effects.effect import Effect
+from .explanations import compare
+from .model import LIKELY, Model, criterion, gain, judged, needed
+from .objective import Objective, Point, Unit
+from .refit import refit
+from .screening import Screen
+
+_ALIKE = 4  # models with an effect of the same group in its place
+_RIVALS = 6  # models with another effect in the place of one
+
+
+def alternatives(
+    train: Objective,
+    validation: Objective,
+    best: Model,
+    *,
+    units: Sequence[Unit],
+    tried: Sequence[Model],
+    first: Screen,
+) -> dict[str, tuple[Model, ...]]:
+    """Return models with another effect in the place of each effect of the best one."""
+    start = tried[0]
+    result: dict[str, tuple[Model, ...]] = {}
+    names = list(dict.fromkeys(unit.name for unit in best.units))
+    for name in names:
+        kept = {u: s for u, s in best.fit.point.strengths.items() if u.name != name}
+        known = [m for m in tried if _stands_in(m, kept, name)]
+        if kept:
+            base = judged(train, validation, refit(train, [Point(best.fit.point.z, kept)]))[0]
+            left = [u for u in units if u not in kept and u.name != name]
+            strongest, most = compare(train, base.fit, left).seen.best(1.0), _RIVALS
+        else:  # the search has tried those that stand out; what acts alike is a rival anyway
+            base, most = start, _ALIKE
+            groups = {u.effect.group for u in best.units}
+            seen = {u.effect for m in known for u in m.units}
+            strongest = {
+                unit: found
+                for unit, found in first.best(1.0).items()
+                if unit.effect.group in groups and unit.name != name and unit.effect not in seen
+            }
+        additions: dict[Effect, dict[Unit, float]] = {}
+        for unit, (_, strength) in strongest.items():
+            if len(additions) < most:
+                additions.setdefault(unit.effect, {unit: strength})
+        known += _fitted(train, validation, base, list(additions.values()), race=best.fit.cost)
+        result[name] = tuple(known)
+    return result
+
+
+def _stands_in(model: Model, kept: dict[Unit, float], name: str) -> bool:
+    """Return whether a model has one other effect beside the kept ones."""
+    others = {u.name for u in model.units if u not in kept}
+    return set(kept) <= set(model.units) and len(others) == 1 and others != {name}
+
+
+def _fitted(
+    train: Objective,
+    validation: Objective,
+    base: Model,
+    additions: Sequence[dict[Unit, float]],
+    *,
+    race: float,
+) -> list[Model]:
+    """Fit the base model with each addition that can come near a cost."""
+    starts = [Point(base.fit.point.z, {**base.fit.point.strengths, **more}) for more in additions]
+    return judged(train, validation, refit(train, starts, race=race)) if starts else []
+
+
+def exchanged(best: Model, others: Mapping[str, Sequence[Model]]) -> Model:
+    """Return the best of a model and its alternatives, itself unless chance is unlikely."""
+    every = [model for models in others.values() for model in models]
+    candidates = [
+        m for m in every if len(m.units) <= len(best.units) or gain(best, m) > needed(best, m)
+    ]
+    first = min([best, *candidates], key=lambda m: criterion(m, best.dispersion()))
+    better_by = criterion(best, best.dispersion()) - criterion(first, best.dispersion())
+    return first if better_by > LIKELY else best

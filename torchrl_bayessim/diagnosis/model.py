@@ -1,0 +1,107 @@
+"""A fitted explanation, and which of two explains the data better."""
+
+from __future__ import annotations
+
+__all__ = ["LIKELY", "Model", "as_good", "criterion", "gain", "judged", "needed"]
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from .objective import Objective, Unit
+from .refit import Fit
+
+Array = NDArray[np.float64]
+LIKELY = 6.0  # a deviance that chance often makes
+_CHANCE = 0.01  # of a test that two models explain the data equally well
+_WORSE = 1.5  # times the misfit of the best model: too much for an equal, however few the data
+_WHITE = 1.2  # mean squared innovation of a model that leaves noise alone
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A fitted explanation.
+
+    Attributes:
+        fit: On the training segments.
+        validation: Weighted innovations on the validation segments, ``(S, KC)``.
+        logs: Which log each segment is from, training then validation.
+    """
+
+    fit: Fit
+    validation: Array
+    logs: NDArray[np.int64]
+
+    @property
+    def units(self) -> tuple[Unit, ...]:
+        """The effects in it."""
+        return self.fit.units
+
+    def deviances(self) -> Array:
+        """Return misfits of all segments, training then validation."""
+        return np.concatenate([(self.fit.innovations**2).sum(-1), (self.validation**2).sum(-1)])
+
+    def dispersion(self) -> float:
+        """Return the variance of what is left of the validation innovations, at least 1."""
+        return max(1.0, float(np.mean(self.validation**2)))
+
+
+def judged(train: Objective, validation: Objective, fits: Sequence[Fit]) -> list[Model]:
+    """Return the fits with their innovations on the validation segments."""
+    held_out = validation([fit.point for fit in fits]) if fits else []
+    first = 1 + int(train.segments.log.max())
+    logs = np.r_[train.segments.log, first + validation.segments.log]
+    return [Model(fit, innovations, logs) for fit, innovations in zip(fits, held_out, strict=True)]
+
+
+def criterion(model: Model, dispersion: float) -> float:
+    """Return the deviance of all segments plus a price per strength; smaller is better."""
+    total = float(model.deviances().sum())
+    return total / dispersion + len(model.units) * np.log(model.deviances().size * 8)
+
+
+def gain(base: Model, model: Model) -> float:
+    """Return how much better the validation segments are explained, in units of the noise."""
+    before, after = (float((m.validation**2).sum()) for m in (base, model))
+    return (before - after) / model.dispersion()
+
+
+def needed(base: Model, model: Model) -> float:
+    """Return the gain on validation that more strengths need: the chance level per strength."""
+    return 4.0 * max(1, len(model.units) - len(base.units))
+
+
+def as_good(best: Model, rival: Model) -> bool:
+    """Return whether the segments do not say that the rival is worse.
+
+    Where the best model leaves noise alone, the likelihood says so. Where something is still wrong
+    with both, it would be too sure, and the segments' differences count by how they vary.
+    """
+    mine, others = best.deviances(), rival.deviances()
+    if float((others - mine).sum()) / best.dispersion() < LIKELY:
+        return True
+    if float(mine.sum()) / (best.fit.innovations.size + best.validation.size) < _WHITE:
+        return False
+    if float(others.sum()) > _WORSE * float(mine.sum()):
+        return False
+    kinds = others - mine, np.log(others / mine)
+    return all(_positive(kind, best.logs) > _CHANCE for kind in kinds)
+
+
+def _positive(differences: Array, logs: NDArray[np.int64]) -> float:
+    """Return the p-value of a positive mean, with errors of segments or of logs.
+
+    What is wrong with both models is wrong all along a log, and speaks for the one in some logs and
+    for the other in others: so the larger error counts, and if it is that of ``G`` logs, Student's
+    distribution with ``G - 1`` degrees of freedom (clustered errors, Liang & Zeger 1986; Cameron &
+    Miller 2015).
+    """
+    mean, count = float(differences.mean()), len(differences)
+    by_log = np.bincount(logs, differences - mean)
+    alone, together = float(((differences - mean) ** 2).sum()), float((by_log**2).sum())
+    score = mean / max(np.sqrt(max(alone, together)) / count, 1e-12)
+    groups = len(np.unique(logs)) if together > alone else count
+    return float(student.sf(score, max(groups - 1, 1)))
