@@ -1,8 +1,8 @@
 """Keeping work: a file that is always whole, and that runs no code when it is read.
 
-`save` writes a temporary file beside the target, forces it to disk and renames it: whoever looks
-sees the old checkpoint or the new one, also after a crash or a power cut. `load` accepts tensors
-and plain values only, and checks the file before it trusts it.
+`save` replaces the file as `whole_file` does: whoever looks sees the old checkpoint or the new one,
+also after a crash or a power cut. `load` accepts tensors and plain values only, and checks the file
+before it trusts it.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from .errors import message
+from .whole_file import replacing
 
 SCHEMA = 1
 """Version of the file's layout; a file with another one is refused."""
@@ -48,18 +49,8 @@ def save(path: str | os.PathLike[str], state: Mapping[str, Any]) -> None:
         {'round': 2, 'weight': tensor([1., 1.])}
     """
     content = {"format": _FORMAT, "schema": SCHEMA, "state": _plain(state, "state")}
-    path = _file(path).absolute()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            torch.save(content, file)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    _sync_folder(path.parent)
+    with replacing(_file(path)) as file:
+        torch.save(content, file)
 
 
 def load(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -127,14 +118,3 @@ def _file(path: str | os.PathLike[str]) -> Path:
             message("the file of a checkpoint", f"the folder {path}", hint=hint)
         )
     return Path(path)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Force the rename itself to disk, where the system lets folders be opened."""
-    if not hasattr(os, "O_DIRECTORY"):
-        return
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

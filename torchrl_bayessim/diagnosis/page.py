@@ -10,6 +10,7 @@ __all__ = ["page", "write_page"]
 
 from pathlib import Path
 
+from ..whole_file import write_text
 from . import panels
 from .markup import Markup, element
 from .report import Report
@@ -26,8 +27,8 @@ _MEANING = {
 
 
 def write_page(report: Report, path: str | Path) -> None:
-    """Write a report as one self-contained HTML file."""
-    Path(path).write_text(page(report), encoding="utf-8")
+    """Write a report as one self-contained HTML file, wholly or not at all."""
+    write_text(path, page(report))
 
 
 def page(report: Report) -> str:

@@ -25,6 +25,7 @@ from ..physics.protocol import Physics
 from ..transforms.apply_effect import ApplyEffect
 from ..transforms.apply_physics import ApplyPhysics
 from ..transforms.effect_physics import EffectPhysics
+from ..whole_file import write_text
 
 Verdict = Literal["none", "named", "named_partial", "ambiguous", "unknown", "not_testable"]
 
@@ -201,9 +202,9 @@ class Report:
         }
 
     def to_json(self, path: str | Path) -> None:
-        """Write the report as JSON."""
+        """Write the report as JSON, wholly or not at all."""
         text = json.dumps(_plain(self.to_dict()), indent=1, allow_nan=False)
-        Path(path).write_text(text, encoding="utf-8")
+        write_text(path, text)
 
     def apply(
         self, env: EnvBase, physics: Physics | None = None, *, channels: Sequence[str] = ()

@@ -1,0 +1,78 @@
+"""A file is the old one or the new one, whoever is killed while writing it."""
+
+import os
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+
+import pytest
+
+from torchrl_bayessim.whole_file import replacing, write_text
+
+ENDS = f"import os; os.kill(os.getpid(), {int(signal.SIGKILL)})"
+HALF = """
+import sys
+from torchrl_bayessim.whole_file import replacing
+with replacing(sys.argv[1]) as file:
+    file.write(b"half")
+    file.flush()
+    {ends}
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "run" / "table.md"
+
+
+def killed_in_mid_write(file):
+    command = [sys.executable, "-W", "ignore", "-c", HALF.format(ends=ENDS), str(file)]
+    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+
+
+def test_the_old_content_stays_until_the_new_one_is_whole(file):
+    write_text(file, "old θ")
+    with replacing(file) as whole:
+        whole.write(b"new")
+        whole.flush()
+        assert file.read_text(encoding="utf-8") == "old θ"
+    assert file.read_bytes() == b"new"
+    assert list(file.parent.iterdir()) == [file]
+
+
+def test_an_error_while_writing_leaves_the_old_content_and_nothing_else(file):
+    write_text(file, "old")
+    with suppress(ZeroDivisionError), replacing(file) as whole:
+        whole.write(b"new")
+        whole.write(bytes(1 // 0))
+    assert file.read_text() == "old"
+    assert list(file.parent.iterdir()) == [file]
+
+
+def test_what_a_killed_writer_left_is_removed_by_the_next(file):
+    write_text(file, "old")
+    killed_in_mid_write(file)
+    (left,) = (path for path in file.parent.iterdir() if path != file)
+    assert left.read_bytes() == b"half"
+    assert file.read_text() == "old"
+    other = left.with_name(f".other.md.{left.name.rpartition('.table.md.')[2]}")
+    own = left.with_name(f".table.md.{os.getpid()}.tmp")
+    running = left.with_name(f".table.md.{os.getppid()}.tmp")
+    for path in (other, own, running):
+        path.write_text("of another file, or of a writer that runs")
+    write_text(file, "new")
+    assert file.read_text() == "new"
+    assert set(file.parent.iterdir()) == {file, other, running}
+
+
+def test_data_are_forced_to_disk_before_the_rename_and_the_folder_after(file, monkeypatch):
+    """Otherwise a power cut leaves an empty file under the new name."""
+    done = []
+    monkeypatch.setattr(
+        os, "fsync", lambda number: done.append(os.readlink(f"/proc/self/fd/{number}"))
+    )
+    with replacing(file) as whole:
+        whole.write(b"new")
+        (written,) = file.parent.iterdir()
+    assert done == [str(written), str(file.parent)]

@@ -1,0 +1,100 @@
+"""Files that are whole at every moment: written beside the target, forced to disk, renamed.
+
+Whoever reads the target sees the old content or the new one, also after a kill or a power cut.
+"""
+
+from __future__ import annotations
+
+__all__ = ["replacing", "write_text"]
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from glob import escape
+from pathlib import Path
+from typing import BinaryIO
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Open a file that takes the place of ``path`` when the block ends without an error.
+
+    Missing folders are made. What a writer of the same file left when it was killed is removed.
+
+    Args:
+        path: The file; replaced if it exists.
+
+    Raises:
+        OSError: It cannot be written; what was there before stays.
+
+    Example:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp()) / "numbers.bin"
+        >>> with replacing(file) as whole:
+        ...     _ = whole.write(b"half")
+        ...     file.exists()
+        False
+        >>> file.read_bytes()
+        b'half'
+    """
+    path = Path(path).absolute()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _sweep(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    _sync_folder(path.parent)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write ``text`` to ``path`` in UTF-8, wholly or not at all.
+
+    Raises:
+        OSError: It cannot be written; what was there before stays.
+
+    Example:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp()) / "table.md"
+        >>> write_text(file, "| θ |")
+        >>> file.read_text(encoding="utf-8")
+        '| θ |'
+    """
+    with replacing(path) as file:
+        file.write(text.encode())
+
+
+def _sweep(path: Path) -> None:
+    """Remove what killed writers of ``path`` left beside it."""
+    for left in path.parent.glob(f".{escape(path.name)}.*.tmp"):
+        writer = left.name.removesuffix(".tmp").rpartition(".")[2]
+        if writer.isdecimal() and not _alive(int(writer)):
+            left.unlink(missing_ok=True)
+
+
+def _alive(process: int) -> bool:
+    if os.name != "posix":  # elsewhere signal 0 is not a question
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
+def _sync_folder(folder: Path) -> None:
+    """Force the rename itself to disk, where the system lets folders be opened."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
