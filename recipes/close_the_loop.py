@@ -40,6 +40,7 @@ from torchrl_bayessim.loop import SimToRealLoop
 from torchrl_bayessim.robots import RecordedLogs
 from torchrl_bayessim.summaries import SummaryStatistics, linear_dynamics, waypoints
 from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
+from torchrl_bayessim.whole_file import write_text
 
 NAMED = ("named", "named_partial")
 PPO_SETTINGS: dict[str, Any] = {
@@ -92,7 +93,7 @@ def job(settings: CloseTheLoop, out: Path) -> dict[str, Any]:
             runs.append(trained(source, reports[seed], logs[seed], settings=settings, seed=seed))
             print(sentence(runs[-1]))
     result = told | revealed() | summarised(runs)
-    (out / "table.md").write_text(table(result))
+    write_text(out / "table.md", table(result))
     draw_figure(out / "close_the_loop.png", result)
     print(table(result))
     return result

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import recipe
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from sim2real_seeds import interval
@@ -109,7 +110,7 @@ def draw_figure(path: Path, result: dict[str, Any]) -> None:
         for s in SOURCES
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
-    figure.savefig(path)
+    recipe.save_picture(figure, path)
 
 
 def _posteriors(axes: Any, runs: list[dict[str, Any]], name: str) -> None:

@@ -19,10 +19,8 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from importlib.util import find_spec
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +39,7 @@ from recovery_methods import (
 )
 from recovery_problems import PROBLEMS, Problem
 from torch import Tensor
+from workers import workers
 
 from torchrl_bayessim import plots
 from torchrl_bayessim.errors import message
@@ -50,6 +49,7 @@ from torchrl_bayessim.simulate import collect_summaries, make_collector
 from torchrl_bayessim.sources import draw
 from torchrl_bayessim.summaries import SummaryStatistics
 from torchrl_bayessim.transforms import DomainRandomizer
+from torchrl_bayessim.whole_file import write_text
 
 REAL = 10  # real trajectories of the paper
 PAPER = ", the paper's statistics"
@@ -83,7 +83,7 @@ def job(settings: Recovery, out: Path) -> dict[str, Any]:
     todo = [(name, seed) for seed in seeds for name in names]
     folder = out / "parts"
     folder.mkdir(exist_ok=True)
-    with ProcessPoolExecutor(settings.processes, mp_context=get_context("spawn")) as pool:
+    with workers(settings.processes) as pool:
         jobs = [pool.submit(run, settings, name, seed, folder) for name, seed in todo]
         parts = []
         for (name, seed), done in zip(todo, jobs, strict=True):
@@ -99,7 +99,7 @@ def job(settings: Recovery, out: Path) -> dict[str, Any]:
         if part["seed"] == settings.seed:
             draw_picture(out, part)
     text = table(result, names)
-    recipe.write(out / "table.md", text)
+    write_text(out / "table.md", text)
     print(text)
     return result
 
@@ -210,7 +210,7 @@ def run(settings: Recovery, name: str, seed: int, folder: Path) -> dict[str, Any
         "draws": draw(q, 2000, key=(seed, "picture")).tolist(),
         "seconds": time.perf_counter() - start,
     }
-    recipe.write(kept, json.dumps(recipe.plain(result)))
+    write_text(kept, json.dumps(recipe.plain(result)))
     return result
 
 
@@ -352,7 +352,7 @@ def draw_picture(out: Path, part: dict[str, Any]) -> None:
         prior_samples=draw(problem.prior, 2000, key=("picture",)),
         truth=torch.tensor([problem.truth[n] for n in problem.prior.names]),
     )
-    figure.savefig(out / f"{part['problem']}.png", dpi=80)
+    recipe.save_picture(figure, out / f"{part['problem']}.png", dpi=80)
 
 
 def table(result: dict[str, Any], names: list[str]) -> str:

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from omegaconf import OmegaConf
@@ -27,6 +27,10 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from torchrl_bayessim.errors import BayesSimError, message
+from torchrl_bayessim.whole_file import replacing, write_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "torchrl_bayessim")
 SEEDS = 2**32
@@ -76,7 +80,7 @@ def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> No
     note(settings, folder)
     result["provenance"] = provenance(settings, seconds=time.monotonic() - start)
     text = json.dumps(plain(result))
-    write(folder / "result.json", text + "\n")
+    write_text(folder / "result.json", text + "\n")
     print(f"RESULT {text}")
 
 
@@ -133,7 +137,7 @@ def debugging(arguments: list[str]) -> bool:
 
 def note(settings: Settings, folder: Path) -> None:
     """Write the settings into the folder of a run."""
-    write(folder / "settings.json", json.dumps(dataclasses.asdict(settings)) + "\n")
+    write_text(folder / "settings.json", json.dumps(dataclasses.asdict(settings)) + "\n")
 
 
 def parse(settings_type: type[S], arguments: list[str]) -> S:
@@ -208,11 +212,10 @@ def provenance(settings: Settings, *, seconds: float) -> dict[str, Any]:
     }
 
 
-def write(path: Path, text: str) -> None:
-    """Write a file wholly or not at all."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(text)
-    temporary.replace(path)
+def save_picture(figure: Figure, path: Path, *, dpi: int = 150) -> None:
+    """Write a figure as PNG, wholly or not at all."""
+    with replacing(path) as file:
+        figure.savefig(file, format="png", dpi=dpi)
 
 
 def plain(value: Any) -> Any:

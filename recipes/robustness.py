@@ -31,6 +31,7 @@ from torch import Tensor
 from training import single_thread
 
 from torchrl_bayessim.errors import message
+from torchrl_bayessim.whole_file import write_text
 
 SOURCES = ("nominal", "prior", "posterior", "oracle")
 # "paper": PPO as rl-zoo sets CartPole, which the paper cites, but for a constant clip range;
@@ -105,7 +106,7 @@ def job(settings: Robustness, out: Path) -> dict[str, Any]:
         ],
         "runs": runs,
     }
-    (out / "table.md").write_text(table(result))
+    write_text(out / "table.md", table(result))
     print(table(result))
     draw_pictures(out, result)
     return result

@@ -7,6 +7,7 @@ import statistics
 from pathlib import Path
 from typing import Any
 
+import recipe
 import torch
 from sim2real_seeds import interval
 
@@ -116,7 +117,7 @@ def draw_pictures(out: Path, result: dict[str, Any]) -> list[Path]:
             lines, xlabel=name, ylabel=result["score"], marks={"the robot": truth}
         )
         paths.append(out / f"robustness_{name}.png")
-        figure.savefig(paths[-1], dpi=150)
+        recipe.save_picture(figure, paths[-1])
     lines = {}
     for source in dict.fromkeys(run["source"] for run in result["runs"]):
         own = [run["curve"] for run in result["runs"] if run["source"] == source]
@@ -127,5 +128,5 @@ def draw_pictures(out: Path, result: dict[str, Any]) -> list[Path]:
     if lines and all(len(x) for x, _ in lines.values()):
         figure = plots.learning_curves(lines, ylabel=f"{result['score']} under its own physics")
         paths.append(out / "learning.png")
-        figure.savefig(paths[-1], dpi=150)
+        recipe.save_picture(figure, paths[-1])
     return paths

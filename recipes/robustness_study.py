@@ -24,6 +24,7 @@ from torchrl_bayessim.simulate import simulate
 from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.summaries import SummaryStatistics
 from torchrl_bayessim.transforms import DomainRandomizer
+from torchrl_bayessim.whole_file import write_text
 
 # Mean return of the episodes that end in a fortieth of the training (Gymnasium's own mark for
 # CartPole), or success in 64 episodes
@@ -61,7 +62,7 @@ class Study:
         found["solved"] = first_solved(shown, SOLVED[self.settings.task])
         names = ("frames", "return", "score", "seconds", "cpu_seconds")
         found["curve"] = [{name: p[name] for name in names if name in p} for p in shown]
-        recipe.write(file, json.dumps(recipe.plain(found)))
+        write_text(file, json.dumps(recipe.plain(found)))
         (self.out / f"{source}.pt").unlink()  # with the replay buffer, a hundred megabytes
         return recipe.plain(found)
 

@@ -16,6 +16,7 @@ from torchrl_bayessim import plots
 from torchrl_bayessim.inference.physics_posterior import PhysicsPosterior
 from torchrl_bayessim.loop import Round
 from torchrl_bayessim.sources import draw
+from torchrl_bayessim.whole_file import write_text
 
 
 class Journal:
@@ -29,7 +30,7 @@ class Journal:
     def add(self, index: int, entry: dict[str, Any]) -> None:
         """Keep the entry of round ``index``, which may be told twice after a break."""
         self.rounds = [*self.rounds[:index], entry]
-        recipe.write(self.path, json.dumps(recipe.plain(self.rounds)))
+        write_text(self.path, json.dumps(recipe.plain(self.rounds)))
 
 
 def describe(
@@ -117,7 +118,7 @@ def draw_pictures(
             truth=torch.tensor(result["true"]),
             zoom=zoom,
         )
-        figure.savefig(out / f"{name}.png", dpi=150)
+        recipe.save_picture(figure, out / f"{name}.png")
     lines = {
         f"under the {name}": (
             torch.tensor([point["frames"] for point in curve if ended(point)]),
@@ -128,7 +129,7 @@ def draw_pictures(
     }
     if lines:
         figure = plots.learning_curves(lines, ylabel="return of finished episodes in simulation")
-        figure.savefig(out / "learning.png", dpi=150)
+        recipe.save_picture(figure, out / "learning.png")
     baseline = result.get("baseline", {})
     figure = plots.return_per_round(
         [entry["real_return"] for entry in result["rounds"]],
@@ -137,7 +138,7 @@ def draw_pictures(
         baseline_interval=tuple(baseline["real_return_ci"]) if baseline else None,
         ylabel=f"{score} at the real system",
     )
-    figure.savefig(out / "return.png", dpi=150)
+    recipe.save_picture(figure, out / "return.png")
 
 
 def ended(point: dict[str, float]) -> bool:

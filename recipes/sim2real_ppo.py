@@ -12,12 +12,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
-import threading
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from importlib.util import find_spec
-from multiprocessing import active_children, get_context, parent_process
+from multiprocessing import active_children
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +25,7 @@ from tasks import TASKS, Task, true_parameters
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.record.loggers import get_logger
+from workers import workers
 
 from torchrl_bayessim.agents.ppo import PPO
 from torchrl_bayessim.errors import message
@@ -189,8 +187,7 @@ class Baseline:
     """The same PPO under the prior, with as many frames, in a process beside the loop."""
 
     def __init__(self, settings: Sim2Real, *, frames: int) -> None:
-        spawn = get_context("spawn")
-        self.pool = ProcessPoolExecutor(1, mp_context=spawn, initializer=end_with_parent)
+        self.pool = workers(1)
         if settings.baseline:
             self.future = self.pool.submit(train_under_prior, settings, frames=frames)
 
@@ -206,18 +203,6 @@ class Baseline:
     def result(self) -> tuple[dict[str, Tensor], list[dict[str, float]]]:
         """Return the policy's weights and the learning curve."""
         return self.future.result()
-
-
-def end_with_parent() -> None:
-    """End this process when its parent does, also if that is killed."""
-    parent = parent_process()
-    assert parent is not None  # it was spawned
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 def train_under_prior(

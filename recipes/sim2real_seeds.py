@@ -22,6 +22,7 @@ import recipe
 from scipy.stats import t as student
 
 from torchrl_bayessim.errors import SimulationError, message
+from torchrl_bayessim.whole_file import write_text
 
 
 @dataclass
@@ -66,7 +67,7 @@ def job(settings: Seeds, out: Path) -> dict[str, Any]:
         "gain": interval(gains),
         "runs": runs,
     }
-    (out / "table.md").write_text(table(result))
+    write_text(out / "table.md", table(result))
     print(table(result))
     return result
 

@@ -19,6 +19,7 @@ from torchrl.record.loggers import Logger
 
 from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
+from torchrl_bayessim.whole_file import replacing
 
 
 class GifLogger(Logger):
@@ -35,7 +36,9 @@ class GifLogger(Logger):
         del name, step
         frames = [Image.fromarray(f.permute(1, 2, 0).numpy()) for f in video[0]]
         first, *others = [f.quantize(64) for f in frames]
-        first.save(self.path, save_all=True, append_images=others, duration=40, loop=0)
+        looped = {"save_all": True, "append_images": others, "duration": 40, "loop": 0}
+        with replacing(self.path) as file:
+            first.save(file, format="GIF", **looped)
 
     def log_scalar(self, *args: Any, **options: Any) -> None:
         """Keep nothing: this logger is for videos, as the others below."""

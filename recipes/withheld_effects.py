@@ -37,6 +37,7 @@ from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.errors import message
 from torchrl_bayessim.logs.read import read_logs
 from torchrl_bayessim.logs.system import System
+from torchrl_bayessim.whole_file import replacing, write_text
 
 TIERS = ("T0", "T1", "T2", "T3", "T4", "T5", "T6", "controls")
 # Robots, and cases by tier and robot. What the issue of a release asks for takes longer than two
@@ -86,7 +87,7 @@ def job(settings: Withheld, out: Path) -> dict[str, Any]:
         | {"case": name}
         for name in names
     ]
-    recipe.write(out / "records.json", json.dumps(recipe.plain(records), indent=1))
+    write_text(out / "records.json", json.dumps(recipe.plain(records), indent=1))
     result = scoring.scores(records, threshold=settings.threshold) | {"labels_sha256": seal}
     page.write_page(records, result, out)
     return result
@@ -108,17 +109,22 @@ def _progress(things: list[Any], settings: Withheld, what: str) -> Iterable[Any]
 
 
 def generate(settings: Withheld, out: Path, *, robots: list[str], tiers: dict[str, int]) -> None:
-    """Write the cases' folders and the sealed labels."""
+    """Write the cases' folders, those that a broken run has not written, and seal the labels."""
     rng = np.random.default_rng([settings.seed, 0])
     labels = {}
     drawn = plans.plans(tiers, robots, rng)
     for i, plan in enumerate(_progress(drawn, settings, "generating")):
-        case = cases.make(plan, np.random.default_rng([settings.seed, 1 + i]))
         name = f"case{i:04d}"
-        folders.hand_over(case, out / "cases" / name)
-        folders.unseen_folder(case, out / "sealed" / name)
-        labels[name] = folders.label(case)
-    recipe.write(out / "sealed" / "labels.json", json.dumps(labels, indent=1))
+        label = out / "sealed" / name / "label.json"
+        if not label.exists():
+            case = cases.make(plan, np.random.default_rng([settings.seed, 1 + i]))
+            for file, text in folders.handed_over(case).items():
+                write_text(out / "cases" / name / file, text)
+            with replacing(label.with_name("unseen.npz")) as file:
+                file.write(folders.unseen(case))
+            write_text(label, json.dumps(folders.label(case)))
+        labels[name] = json.loads(label.read_text())
+    write_text(out / "sealed" / "labels.json", json.dumps(labels, indent=1))
 
 
 def examine(case: Path, report: Path, *, seed: int) -> None:
@@ -131,7 +137,7 @@ def examine(case: Path, report: Path, *, seed: int) -> None:
         found = {"verdict": "crash", "summary": f"{type(error).__name__}: {error}"}
     found["seconds"] = time.perf_counter() - begun
     report.parent.mkdir(exist_ok=True)
-    recipe.write(report, json.dumps(scoring.finite(found)))
+    write_text(report, json.dumps(scoring.finite(found)))
 
 
 def realised(out: Path, name: str, report: Mapping[str, Any]) -> float | None:

@@ -6,9 +6,10 @@ labels are in one file beside them, whose SHA-256 is printed before the first di
 
 from __future__ import annotations
 
-__all__ = ["digest", "hand_over", "label", "unseen_folder"]
+__all__ = ["digest", "handed_over", "label", "unseen"]
 
 import hashlib
+import io
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -23,8 +24,8 @@ from .plant import Motion
 from .robots import ROBOTS, Robot, nominal_model
 
 
-def hand_over(case: Case, folder: Path) -> None:
-    """Write what the diagnosis may see."""
+def handed_over(case: Case) -> dict[str, str]:
+    """Return the files that the diagnosis may see, by name."""
     robot = ROBOTS[case.plan.robot]
     model = nominal_model(robot)
     joints = [model.joint(j).name for j in range(model.njnt)]
@@ -46,33 +47,35 @@ def hand_over(case: Case, folder: Path) -> None:
     if case.noise is not None:
         names = [*columns["qpos"].values(), *columns.get("qvel", {}).values()]
         system["noise"] = dict(zip(names, map(float, case.noise), strict=False))
-    folder.mkdir(parents=True)
-    (folder / "system.yaml").write_text(yaml.safe_dump(system, sort_keys=False))
+    files = {"system.yaml": yaml.safe_dump(system, sort_keys=False)}
     if robot.simulator == "robot.xml":
-        (folder / "robot.xml").write_text(robot.xml)
-    _write(case.motions, folder, columns=columns, dt=robot.control_dt, model=model)
+        files["robot.xml"] = robot.xml
+    return files | _logs(case.motions, columns=columns, dt=robot.control_dt, model=model)
 
 
-def unseen_folder(case: Case, folder: Path) -> None:
-    """Write noise-free motions with new inputs, for the true shrinkage; sealed with the labels."""
-    folder.mkdir(parents=True)
+def unseen(case: Case) -> bytes:
+    """Return noise-free motions with new inputs, for the true shrinkage; sealed with the labels."""
     arrays = {f"clean{i}": m.clean for i, m in enumerate(case.unseen)}
     arrays |= {f"ctrl{i}": m.ctrl for i, m in enumerate(case.unseen)}
-    np.savez_compressed(folder / "unseen.npz", **arrays)
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)
+    return file.getvalue()
 
 
-def _write(
-    motions: Sequence[Motion], folder: Path, *, columns: dict, dt: float, model: mujoco.MjModel
-) -> None:
+def _logs(
+    motions: Sequence[Motion], *, columns: dict, dt: float, model: mujoco.MjModel
+) -> dict[str, str]:
     header = ["t", *columns["qpos"].values(), *columns.get("qvel", {}).values()]
     header += columns["ctrl"].values()
+    files = {}
     for i, motion in enumerate(motions):
         time = dt * np.arange(len(motion.ctrl))[:, None]
         width = 2 * model.nv if "qvel" in columns else model.nv
         rows = np.concatenate([time, motion.measured[:, :width], motion.ctrl], 1)
         text = ",".join(header) + "\n"
         text += "\n".join(",".join(f"{x:.9g}" for x in row) for row in rows) + "\n"
-        (folder / f"run{i:02d}.csv").write_text(text)
+        files[f"run{i:02d}.csv"] = text
+    return files
 
 
 def label(case: Case) -> dict[str, Any]:

@@ -9,6 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import recipe
+
+from torchrl_bayessim.whole_file import write_text
 
 from .classes import CLASSES
 
@@ -29,7 +32,7 @@ def write_page(records: Sequence[Record], result: Mapping[str, Any], out: Path) 
         "## Failures",
         _failures(records, result["threshold"]),
     ]
-    (out / "page.md").write_text("\n\n".join(parts) + "\n")
+    write_text(out / "page.md", "\n\n".join(parts) + "\n")
     _confusion(records, result["threshold"], out / "confusion.png")
     _calibration(records, out / "calibration.png")
 
@@ -103,7 +106,7 @@ def _confusion(records: Sequence[Record], threshold: float, path: Path) -> None:
     axes.set_xticks(range(len(names)), names, rotation=60, ha="right")
     axes.set_yticks(range(len(names) - 1), names[:-1])
     axes.set(xlabel="named", ylabel="true class", title="T1 and T2, visible causes")
-    figure.savefig(path, dpi=120)
+    recipe.save_picture(figure, path, dpi=120)
 
 
 def _calibration(records: Sequence[Record], path: Path) -> None:
@@ -121,4 +124,4 @@ def _calibration(records: Sequence[Record], path: Path) -> None:
         xlabel="true share of the gap removed, noise-free new inputs", ylabel="predicted",
         xlim=(-0.1, 1.1), ylim=(-0.1, 1.1),
     )  # fmt: skip
-    figure.savefig(path, dpi=120)
+    recipe.save_picture(figure, path, dpi=120)
