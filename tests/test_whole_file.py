@@ -1,10 +1,12 @@
 """A file is the old one or the new one, whoever is killed while writing it."""
 
+import ast
 import os
 import signal
 import subprocess
 import sys
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
@@ -76,3 +78,29 @@ def test_data_are_forced_to_disk_before_the_rename_and_the_folder_after(file, mo
         whole.write(b"new")
         (written,) = file.parent.iterdir()
     assert done == [str(written), str(file.parent)]
+
+
+def writers(path):
+    """Yield the lines of a file that write another one in place."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute | ast.Name):
+            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            modes = [a.value for a in node.args if isinstance(a, ast.Constant)]
+            opened = name == "open" and any(set("wax+") & set(str(mode)) for mode in modes)
+            method = isinstance(node.func, ast.Attribute) and name in {"write_text", "write_bytes"}
+            if opened or method:
+                yield node.lineno
+
+
+def test_nothing_else_in_the_package_or_the_recipes_writes_a_file():
+    root = Path(__file__).parent.parent
+    parts = [(root / "torchrl_bayessim").rglob("*.py"), (root / "recipes").rglob("*.py")]
+    found = {
+        f"{path.relative_to(root)}:{line}"
+        for part in parts
+        for path in part
+        if path.parent.name != "benchmarks"
+        for line in writers(path)
+    }
+    (only,) = found
+    assert only.startswith("torchrl_bayessim/whole_file.py:")
