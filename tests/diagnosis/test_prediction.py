@@ -86,7 +86,7 @@ ARM_UNITS = deterministic(System(task=arm()).robot)
 def worst(task, log, unit=None, strength=0.0):
     system = System(task=task)
     predictor = Predictor(system, threads=1)
-    predictor.exact = True
+    predictor.exactly()
     strengths = {}
     if unit is not None:
         strengths[unit.effect] = strength * np.array([unit.direction])
@@ -102,6 +102,15 @@ def test_replay_does_what_the_transform_does(name):
     # actions are single precision in the environment
     assert worst(arm(), log, unit, strength) < 1e-5
     assert worst(arm(), log) > 1e-4
+
+
+def test_what_one_candidate_has_the_next_has_not():
+    predictor = Predictor(System(task=arm()), threads=1)
+    segments, nothing = cut([recorded(arm())], 20, history=2), np.zeros((1, 0))
+    before = predictor.residuals(segments, nothing)
+    for unit in ARM_UNITS.values():
+        predictor.residuals(segments, nothing, {unit.effect: 0.3 * np.array([unit.direction])})
+        np.testing.assert_array_equal(predictor.residuals(segments, nothing), before)
 
 
 @pytest.mark.parametrize("name", ["coulomb_friction", "action_delay", "quadratic_drag"])

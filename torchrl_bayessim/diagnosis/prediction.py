@@ -8,11 +8,10 @@ once per candidate, effects on forces at every time step. What is returned is th
 
 from __future__ import annotations
 
-__all__ = ["Predictor"]
+__all__ = ["Predictor", "fewest_parts"]
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -31,7 +30,7 @@ from ..effects.fields import ModelFields
 from ..effects.forcing import Forcing
 from ..envs.model_batch import ModelBatch
 from ..envs.stepper import Stepper
-from ..envs.task import Readings, Task
+from ..envs.task import Readings
 from ..logs.system import System
 from .commands import commanded
 from .segments import Segments
@@ -64,46 +63,64 @@ class Predictor:
 
     Args:
         system: The robot, its simulator and what was measured.
+        substeps: Time steps per control step; default the task's.
         threads: Threads; default all cores that this process may use.
 
     Attributes:
         system: The robot.
         tangent: The tangent space of its positions.
         sensing: Its measured channels.
+        substeps: Time steps per control step.
         steps: Time steps simulated so far.
         exact: Whether forces follow the state at every time step, as in an environment, and not
             only every 10 ms, which is enough to tell effects apart.
         realisation: Seed of random effects.
     """
 
-    def __init__(self, system: System, *, threads: int | None = None) -> None:
+    def __init__(
+        self, system: System, *, substeps: int | None = None, threads: int | None = None
+    ) -> None:
         self.system = system
         self.tangent = Tangent(system.task.model)
         self.sensing = Sensing(system, self.tangent)
         self.steps = 0
         self.exact = False
         self.realisation = 0
-        task = system.task
-        self._models = ModelBatch(task.model, 1)
+        self._threads = threads
+        self._forcing = Forcing(system.robot)
+        self._divide(substeps or system.task.frame_skip)
+
+    def _divide(self, substeps: int) -> None:
+        """Take so many time steps per control step."""
+        self.substeps = substeps
+        task = self.system.task
+        model = copy.copy(task.model)
+        model.opt.timestep = task.dt / substeps
+        self._models = ModelBatch(model, 1)
         # from the beginning, since what one table overrides stays in a thread's model after it
         self._entries = {
             name: np.array([self._models.column(name, (d,)) for d in range(self.tangent.size)])
             for name in ("dof_frictionloss", "dof_damping")
         }
-        self._threads = threads
-        self._stepper = Stepper(task.model, 1, drive=task.drive, threads=threads)
-        self._forcing = Forcing(system.robot)
+        self._stepper = Stepper(model, 1, drive=task.drive, threads=self._threads)
+
+    def exactly(self) -> None:
+        """From now on take the task's own time steps, and let forces follow the state at each."""
+        self.exact = True
+        if self.substeps != self.system.task.frame_skip:
+            self._divide(self.system.task.frame_skip)
+            self.__dict__.pop("finer", None)
+
+    def divided(self, substeps: int) -> Predictor:
+        """Return the same with another number of time steps per control step."""
+        other = Predictor(self.system, substeps=substeps, threads=self._threads)
+        other.exact, other.realisation = self.exact, self.realisation
+        return other
 
     @cached_property
     def finer(self) -> Predictor:
         """The same with half the time step, to see what the time step does."""
-        task = self.system.task
-        model = copy.copy(task.model)
-        model.opt.timestep /= 2
-        halved = replace(task, model=model, frame_skip=2 * task.frame_skip)
-        other = Predictor(replace(self.system, task=halved), threads=self._threads)
-        other.exact = self.exact
-        return other
+        return self.divided(2 * self.substeps)
 
     def residuals(
         self,
@@ -192,12 +209,15 @@ class Predictor:
             if isinstance(effect, ForceEffect):
                 hooked |= values.any(1)
         rows = np.arange(count * size).reshape(count, size)
-        substeps = self.system.task.frame_skip
-        self.steps += count * size * horizon * substeps
+        self.steps += count * size * horizon * self.substeps
         free = rows[~hooked].reshape(-1)
         if len(free):
             stepper.rollout(
-                commands, substeps=substeps, sequence=sequence, rows=free, outputs=simulated
+                commands,
+                substeps=self.substeps,
+                sequence=sequence,
+                rows=free,
+                outputs=simulated,
             )
         if hooked.any():
             some = {e: s[hooked] for e, s in strengths.items() if isinstance(e, ForceEffect)}
@@ -230,8 +250,7 @@ class Predictor:
         nominal = {name: models.table[rows][:, at] for name, at in self._entries.items()}
         command = np.empty((stepper.num_envs, 1, commands.shape[2]))
         alive = np.ones(len(rows), dtype=bool)
-        frame_skip = self.system.task.frame_skip
-        parts = frame_skip if self.exact else _parts(self.system.task)
+        parts = self.substeps if self.exact else fewest_parts(self.substeps, self.system.task.dt)
         held = self.system.task.dt / parts
         for t in range(segments.horizon):
             ctrl = torch.from_numpy(commands[:, t])
@@ -248,7 +267,7 @@ class Predictor:
                 command[rows, 0] = ctrl + added["ctrl"] if "ctrl" in added else ctrl
                 now = rows[alive]
                 stepper.rollout(
-                    command, substeps=frame_skip // parts, rows=now, outputs=stepper.outputs
+                    command, substeps=self.substeps // parts, rows=now, outputs=stepper.outputs
                 )
                 alive[alive] = stepper.status[now] == 0
             simulated[rows[alive], t] = stepper.outputs[rows[alive], 0]
@@ -276,9 +295,9 @@ class Predictor:
         """Set the model entries of every candidate: parameters first, then effects on top."""
         models = self._models
         models.resize(len(theta))
+        models.restore()
         everyone = torch.ones(len(theta), dtype=torch.bool)
         if self.system.physics is not None:
-            models.restore()
             batch: Any = _Batch(models)
             values = torch.from_numpy(np.ascontiguousarray(theta))
             empty = TensorDict(batch_size=batch.batch_size)
@@ -290,7 +309,8 @@ class Predictor:
         fields.finish()
 
 
-def _parts(task: Task) -> int:
+def fewest_parts(substeps: int, dt: float) -> int:
     """Return into how many equal parts a control step is divided, each 10 ms at most."""
-    fewest = int(np.ceil(task.dt / _HELD - 1e-9))
-    return next(n for n in range(max(1, fewest), task.frame_skip + 1) if task.frame_skip % n == 0)
+    fewest = max(1, int(np.ceil(dt / _HELD - 1e-9)))
+    whole = (n for n in range(fewest, substeps + 1) if substeps % n == 0)
+    return next(whole, substeps)

@@ -22,6 +22,7 @@ from .objective import Objective, Point, Unit, parameters_at, pushes_of
 from .prediction import Predictor
 from .refit import Fit, refit
 from .segments import Segments, cut
+from .time_steps import with_fewest_steps
 from .unseen import require_seen
 from .whitening import Whitening, innovation_noise, noise_from_differences, whitening
 
@@ -149,6 +150,7 @@ def prepare(
     noise, source = _noise(system, predictor, parts["train"], history=history, alarms=alarms)
     some = cut(parts["train"], min(_STEPS, shortest // 2), history=history, most=_FEW)
     require_seen(predictor, some, parameters_at(system.prior, _start(system)), noise)
+    predictor = with_fewest_steps(predictor, some, units, z=_start(system), noise=noise)
     if horizon is None:
         horizon = _horizon(
             predictor, system, parts["train"], units=units, noise=noise, history=history

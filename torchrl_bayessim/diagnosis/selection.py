@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..effects.effect import ForceEffect
 from .alternatives import alternatives, exchanged
 from .explanations import bent, compare, explanations
 from .model import Model, as_good, criterion, gain, judged, needed
@@ -29,6 +28,7 @@ _REST = 0.5  # of what the base leaves: what any further effect must remove
 _REMAINS = 0.01  # of the gap: not worth another effect
 _WRONG = 1.5  # mean squared innovation of a base that something is missing from
 _MOST = 4  # effects in one explanation
+_UNSEEN = 1.0  # a deviance that no test can detect
 _EXCHANGES = 3  # of effects for others in their places
 _APART = 3  # effects without each of which a model is fitted with derivatives of its own
 
@@ -138,14 +138,20 @@ def _all_explained(start: Model, best: Model) -> bool:
 
 
 def _exactly(train: Objective, validation: Objective, model: Model) -> Model:
-    """Fit a model with forces that follow the state at every time step, if it has any.
+    """Fit a model with the simulator's own time steps and forces that follow the state at each.
 
-    Held for 10 ms they lag, and what lags looks like a delay to the next round.
+    Where that can be seen: forces that are held for 10 ms lag, and what lags looks like a delay to
+    the next round.
     """
-    forced = any(isinstance(unit.effect, ForceEffect) for unit in model.units)
-    if not forced or train.predictor.exact:
+    if train.predictor.exact:
         return model
-    train.predictor.exact = validation.predictor.exact = True
+    exact = train.predictor.divided(train.predictor.system.task.frame_skip)
+    exact.exactly()
+    there = Objective(exact, train.prior, train.segments, train.whitening)([model.fit.point])[0]
+    if float(((there - model.fit.innovations) ** 2).sum()) < _UNSEEN:
+        return model
+    for predictor in {train.predictor, validation.predictor}:
+        predictor.exactly()
     return judged(train, validation, refit(train, [model.fit.point], iterations=4))[0]
 
 
