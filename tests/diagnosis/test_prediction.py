@@ -151,6 +151,13 @@ def test_candidates_do_not_touch_each_other():
     np.testing.assert_allclose(together[0], together[-1], atol=1e-12)
 
 
+def test_candidates_leave_nothing_behind_where_no_parameter_is_uncertain():
+    predictor, segments = Predictor(System(task=arm()), threads=1), cut([recorded(arm())], 10)
+    before = predictor.residuals(segments, np.zeros((2, 0)))
+    predictor.residuals(segments, np.zeros((2, 0)), {effect("payload"): np.full((2, 2), 0.2)})
+    np.testing.assert_array_equal(predictor.residuals(segments, np.zeros((2, 0))), before)
+
+
 @pytest.mark.parametrize(
     ("name", "strength", "see"),
     [
