@@ -29,9 +29,9 @@ from ..logs.log import Log
 from .confusion import rivals, stand_in
 from .excitations import excitations
 from .objective import Objective, Point, Unit, strengths_of
-from .preparation import Prepared, cut_for_fits
+from .preparation import Prepared
 from .refit import Fit, refit
-from .segments import cut
+from .segments import cut, cut_for_fits
 from .selection import Selection
 from .whitening import whitening
 
@@ -158,6 +158,7 @@ def _played(prepared: Prepared, commands: Array, point: Point) -> Log | None:
     first = prepared.logs["train"][0]
     count = len(commands)
     robot, predictor = prepared.predictor.system.robot, prepared.predictor
+    known = first.uncertainty
     rest = replace(
         first,
         name="experiment",
@@ -166,6 +167,7 @@ def _played(prepared: Prepared, commands: Array, point: Point) -> Log | None:
         qvel=torch.zeros(count, first.qvel.shape[1], dtype=torch.float64),
         ctrl=torch.from_numpy(commands),
         first_row=0,
+        uncertainty=None if known is None else known.mean(0, keepdim=True).expand(count, -1, -1),
     )
     whole = cut([rest], count - 1, history=prepared.sets["train"].segments.history)
     theta = prepared.sets["train"].theta(point.z[None])

@@ -155,7 +155,7 @@ def _shortened(segments: Segments) -> Segments:
     """Return the same stretches in shorter segments."""
     horizon = min(_SHORT, segments.horizon)
     offsets = range(0, segments.horizon - horizon + 1, horizon)
-    width = 2 * segments.history + horizon + 1
+    width, known = 2 * segments.history + horizon + 1, segments.uncertainty
     windows = {
         name: np.concatenate([getattr(segments, name)[:, o : o + width] for o in offsets])
         for name in ("time", "qpos", "qvel", "ctrl")
@@ -166,6 +166,7 @@ def _shortened(segments: Segments) -> Segments:
         checked=np.arange(1, horizon + 1, dtype=np.int64),
         log=np.tile(segments.log, len(offsets)),
         start=np.concatenate([segments.start + o for o in offsets]),
+        uncertainty=None if known is None else np.tile(known, (len(offsets), 1, 1)),
         **windows,
     )
 

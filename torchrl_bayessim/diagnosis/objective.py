@@ -13,7 +13,16 @@ already absorbed it.
 
 from __future__ import annotations
 
-__all__ = ["Objective", "Point", "Unit", "parameters_at", "pushes_of", "strengths_of", "units_of"]
+__all__ = [
+    "Objective",
+    "Point",
+    "Unit",
+    "origin",
+    "parameters_at",
+    "pushes_of",
+    "strengths_of",
+    "units_of",
+]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -163,6 +172,11 @@ class Objective:
         share = np.array([point.z[-1] for point in points])
         drift = self.whitening.drift * self.whitening.weights[:, None]
         return self.whitening(self.raw(points, offsets)) - share[:, None, None] * drift
+
+
+def origin(prior: Prior | None) -> Array:
+    """Return where fits start: the prior's mean, and none of the time step's error."""
+    return np.zeros(1 + (0 if prior is None else len(prior.names)))
 
 
 def parameters_at(prior: Prior | None, z: Array) -> Array:

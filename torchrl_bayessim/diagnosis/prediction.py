@@ -152,18 +152,19 @@ class Predictor:
         return np.concatenate(parts)
 
     def states(
-        self, segments: Segments, theta: Array, strengths: Strengths | None = None
+        self,
+        segments: Segments,
+        theta: Array,
+        strengths: Strengths | None = None,
+        offsets: Array | None = None,
     ) -> tuple[Array, Array]:
         """Return simulated positions and velocities, ``(P, S, H, nq)`` and ``(P, S, H, nv)``.
 
-        Args:
-            segments: What to replay.
-            theta: Parameters, shape ``(P, D)``.
-            strengths: Of the effects that are on somewhere.
+        Arguments are those of `residuals`.
         """
         strengths = with_late_commands(strengths or {}, len(self.system.robot.actuators))
         restored = self.sensing.restored(segments, strengths, len(theta))
-        simulated = self._simulate(segments, theta, strengths, restored=restored)
+        simulated = self._simulate(segments, theta, strengths, restored=restored, offsets=offsets)
         nq = self.system.task.model.nq
         return simulated[..., :nq], simulated[..., nq : nq + self.tangent.size]
 

@@ -6,7 +6,7 @@ the validation logs too, and the test logs are opened once, for the figures that
 
 from __future__ import annotations
 
-__all__ = ["Prepared", "cut_for_fits", "prepare", "split"]
+__all__ = ["Prepared", "prepare", "split"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,28 +18,27 @@ from numpy.typing import NDArray
 from ..errors import message
 from ..logs.log import Log
 from ..logs.system import System
-from .objective import Objective, Point, Unit, parameters_at, pushes_of
+from .hidden import hidden_joints
+from .horizon import chosen_horizon
+from .noise import assumed_noise, measured_noise
+from .objective import Objective, Point, Unit, origin, parameters_at
 from .prediction import Predictor
 from .refit import Fit, refit
-from .segments import Segments, cut
+from .segments import Segments, cut, cut_for_fits
 from .time_steps import with_fewest_steps
-from .unseen import require_seen
-from .whitening import Whitening, innovation_noise, noise_from_differences, whitening
+from .whitening import Whitening, whitening
 
 Array = NDArray[np.float64]
-_LADDER = (3, 10, 20, 40, 80, 160)
-_CHECKS = 10  # compared rows per segment
-_SKIP = 5  # control steps: the longest delay
 _HISTORY = 0.4  # seconds of commands that delay lines and filters look back at
 _ROWS = {"train": 900, "validation": 600, "test": 600}  # control steps simulated per candidate
 _FEWEST = 12  # rows of a run
-_PROBE = 100  # control steps on which horizons are compared
 _STEPS = 20  # over which a joint that nobody measured would be seen
+_ROUNDS = 3  # in which what nobody measured and the parameters are fitted in turn
+_MANY = 60  # segments on which they are
 _FEW = 8  # segments on which the parameters are fitted first
 _PIECE = 0.25  # of the median log's length, below which it is a piece of one
 _AS_LONG = 1.25  # ratio of two lengths that count as one
 _DEAL = "train", "test", "validation", "train", "train", "test", "validation", "train"
-_WORTH = 0.2  # nats per effect that a longer horizon must bring
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +129,8 @@ def prepare(
         horizon: Control steps per segment; default chosen.
 
     Raises:
-        ValueError: No log is long enough, or a joint that matters was not logged.
+        ValueError: No log is long enough, or a joint that matters was not logged and what was does
+            not say what it did.
     """
     if not logs:
         raise ValueError(message("logs", "none"))
@@ -147,12 +147,14 @@ def prepare(
             "runs, and intervals are too narrow"
         )
     history = min(max(8, round(_HISTORY / system.control_dt)), 100)
-    noise, source = _noise(system, predictor, parts["train"], history=history, alarms=alarms)
+    parts = _completed(predictor, system, parts, history=history, alarms=alarms)
+    noise, source = measured_noise(
+        system, predictor, parts["train"], history=history, alarms=alarms
+    )
     some = cut(parts["train"], min(_STEPS, shortest // 2), history=history, most=_FEW)
-    require_seen(predictor, some, parameters_at(system.prior, _start(system)), noise)
-    predictor = with_fewest_steps(predictor, some, units, z=_start(system), noise=noise)
+    predictor = with_fewest_steps(predictor, some, units, z=origin(system.prior), noise=noise)
     if horizon is None:
-        horizon = _horizon(
+        horizon = chosen_horizon(
             predictor, system, parts["train"], units=units, noise=noise, history=history
         )
         horizon = min(horizon, shortest // 2)
@@ -165,104 +167,40 @@ def prepare(
     return Prepared(predictor, sets, parts, noise, source, horizon, nominal, tuple(alarms))
 
 
-def cut_for_fits(logs: Sequence[Log], horizon: int, *, history: int, most: int) -> Segments:
-    """Cut logs into the segments that fits, screens and figures are made on."""
-    return cut(
-        logs,
-        horizon,
-        history=history,
-        most=most,
-        checks=_CHECKS,
-        burn_in=history,
-        skip=_SKIP,
-    )
-
-
-def _start(system: System) -> Array:
-    return np.zeros(1 + (0 if system.prior is None else len(system.prior.names)))
-
-
-def _coordinates(predictor: Predictor, log: Log) -> Array:
-    """Return the measured channels as tangent coordinates seen from the first row, ``(T, C)``."""
-    qpos = log.qpos.numpy()
-    both = [predictor.tangent.difference(qpos[:1], qpos), log.qvel.numpy()]
-    return np.concatenate(both, -1)[:, list(predictor.system.channel_index)]
-
-
-def _noise(
-    system: System,
+def _completed(
     predictor: Predictor,
-    logs: Sequence[Log],
+    system: System,
+    parts: Mapping[str, list[Log]],
     *,
     history: int,
     alarms: list[str],
-) -> tuple[Array, str]:
-    """Return each channel's noise: the differences of innovations, checked by the sensor's spec."""
-    values = [_coordinates(predictor, log) for log in logs]
-    smooth = noise_from_differences(logs, values)
-    channels = system.robot.channels
-    given = np.array([system.noise.get(name, np.nan) for name in channels])
-    tiny = 1e-6 * system.robot.channel_scale.numpy()
-    noise = np.maximum(np.where(np.isnan(given), smooth, given), tiny)
-    steps = min(8, min(len(log) for log in logs) // 2)
-    pieces = cut(logs, steps, history=history, most=60, burn_in=history)
-    pushes = pushes_of(system.robot)
-    z = _start(system)
-    for _ in range(2):
-        white = whitening(predictor, pieces, parameters_at(system.prior, z), noise)
-        objective = Objective(predictor, system.prior, pieces, white)
-        fit = refit(objective, [Point(z)], iterations=4)[0]
-        z = fit.point.z
-        points = [Point(z, {unit: 0.1 * unit.high}) for unit in pushes]
-        pushed = objective(points) if points else np.zeros((0, *fit.innovations.shape))
-        factor = innovation_noise(fit.innovations, pushed - fit.innovations, len(pieces.checked))
-        factor = np.clip(factor, 0.2, 5.0)
-        noise = np.maximum(noise * factor, tiny)
-    apart = [
-        f"{name}: {estimate:.3g} against {spec:.3g}"
-        for name, estimate, spec in zip(channels, noise, given, strict=True)
-        if spec > 0 and not 0.7 < estimate / spec < 1.4
-    ]
-    if apart:
-        alarms.append("noise floor uncertain, estimated against specified: " + ", ".join(apart))
-    return noise, "differences of innovations"
+) -> dict[str, list[Log]]:
+    """Return the logs with estimates of what was not measured and matters.
 
-
-def _horizon(
-    predictor: Predictor,
-    system: System,
-    logs: Sequence[Log],
-    *,
-    units: Sequence[Unit],
-    noise: Array,
-    history: int,
-) -> int:
-    """Return the horizon at which the effects would show most, per segment row simulated.
-
-    Chosen on what simulations of the effects would look like, never on the residuals: largest
-    ``Σ_e log(1 + λ_e)`` with ``λ_e`` the squared length of the whitened signature at a tenth of the
-    range, as long as second differences stay below first ones.
+    They and the parameters that they depend on are fitted in turn.
     """
-    z = _start(system)
-    units = list({unit.name: unit for unit in units}.values())
-    typical = float(np.median([len(log) for log in logs]))
-    best, choice = -np.inf, _LADDER[0]
-    for steps in _LADDER:
-        if steps > typical / 5:
-            break
-        pieces = cut_for_fits(logs, steps, history=history, most=max(4, _PROBE // steps))
-        white = whitening(predictor, pieces, parameters_at(system.prior, z), noise)
-        if white.curvature > 1.0 and np.isfinite(best):
-            break
-        objective = Objective(predictor, system.prior, pieces, white)
-        points = [Point(z), *(Point(z, {unit: 0.1 * unit.high}) for unit in units)]
-        innovations = objective(points)
-        change = ((innovations[1:] - innovations[0]) ** 2).sum((1, 2))
-        per_row = change * (sum(len(log) for log in logs) / (len(pieces) * steps))
-        value = float(np.log1p(per_row).sum())
-        if value > best + _WORTH * len(units):
-            best, choice = value, steps
-    return choice
+    noise = assumed_noise(system, predictor, parts["train"])
+    theta = parameters_at(system.prior, origin(system.prior))
+    steps = min(_STEPS, min(max(len(log) for log in part) for part in parts.values()) // 2)
+    some = cut(parts["train"], steps, history=history, most=_FEW)
+    hidden = hidden_joints(predictor, some, theta, noise)
+    if not hidden:
+        return dict(parts)
+    predictor = with_fewest_steps(predictor, some, (), z=origin(system.prior), noise=noise)
+    curvature = 0.0
+    for _ in range(_ROUNDS if system.prior is not None else 1):
+        train = hidden.estimated(predictor, parts["train"], theta=theta, noise=noise)
+        pieces = cut_for_fits(train, steps, history=history, most=_MANY)
+        fit, whitenings = _nominal(predictor, system, {"train": pieces}, noise=noise)
+        theta = parameters_at(system.prior, fit.point.z)
+        curvature = whitenings["train"].curvature
+    hidden.require_sure(curvature)
+    found = {
+        name: hidden.estimated(predictor, logs, theta=theta, noise=noise)
+        for name, logs in parts.items()
+    }
+    alarms.append(hidden.note(found["train"]))
+    return found
 
 
 def _nominal(
@@ -271,10 +209,10 @@ def _nominal(
     pieces: Mapping[str, Segments],
     *,
     noise: Array,
-    generator: np.random.Generator,
+    generator: np.random.Generator | None = None,
 ) -> tuple[Fit, dict[str, Whitening]]:
     """Fit the parameters, with the whitening and the robust weights that belong to the fit."""
-    z = _start(system)
+    z = origin(system.prior)
     every = max(1, len(pieces["train"]) // _FEW)
     some = pieces["train"].take(np.arange(0, len(pieces["train"]), every))
     for _ in range(2):

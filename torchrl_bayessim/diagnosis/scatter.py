@@ -18,8 +18,9 @@ from ..logs.log import Log
 from .chance import Chance
 from .holds import Hold
 from .objective import Objective, Point, Unit, strengths_of
-from .preparation import Prepared, cut_for_fits, split
+from .preparation import Prepared, split
 from .report import Candidate, Finding
+from .segments import cut_for_fits
 from .selection import Selection
 from .shrinkage import Shrinkage
 
@@ -29,6 +30,8 @@ _DRAWS = 1000
 def gap_with_holds(prepared: Prepared, logs: Sequence[Log], selection: Selection) -> float:
     """Return the mean squared innovation of test segments cut from the logs as recorded."""
     test = prepared.sets["test"]
+    if test.segments.uncertainty is not None:  # the held samples entered the estimates too
+        return 1.0
     size = len(test.segments)
     pieces = cut_for_fits(
         split(logs)["test"], prepared.horizon, history=test.segments.history, most=size

@@ -8,10 +8,10 @@ from which delay lines and filters know what came in.
 
 from __future__ import annotations
 
-__all__ = ["Segments", "cut"]
+__all__ = ["Segments", "cut", "cut_for_fits"]
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ from ..errors import message
 from ..logs.log import Log
 
 Array = NDArray[np.float64]
+_CHECKS = 10  # compared rows per segment
+_SKIP = 5  # control steps: the longest delay
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,8 @@ class Segments:
         qvel: Velocities, windows, shape ``(S, W, nv)``.
         ctrl: Commands, windows, shape ``(S, W, A)``.
         velocity_gain: Noise of an estimated velocity per noise of the position, ``(nv,)``.
+        uncertainty: Covariance of what was estimated of each start state, ``(S, 2 nv, 2 nv)``;
+            nothing where all that matters was measured.
     """
 
     horizon: int
@@ -52,6 +56,7 @@ class Segments:
     qvel: Array
     ctrl: Array
     velocity_gain: Array
+    uncertainty: Array | None = None
 
     def __len__(self) -> int:
         return len(self.start)
@@ -66,9 +71,9 @@ class Segments:
         arrays = {
             n: getattr(self, n)[index] for n in ("log", "start", "time", "qpos", "qvel", "ctrl")
         }
-        return Segments(
-            self.horizon, self.history, self.checked, velocity_gain=self.velocity_gain, **arrays
-        )
+        if self.uncertainty is not None:
+            arrays["uncertainty"] = self.uncertainty[index]
+        return replace(self, **arrays)
 
 
 def cut(
@@ -148,4 +153,26 @@ def cut(
         windows("qvel"),
         windows("ctrl"),
         gains.max(0),
+        _uncertainty(logs, found),
+    )
+
+
+def _uncertainty(logs: Sequence[Log], found: Sequence[tuple[int, int]]) -> Array | None:
+    """Return that of the starts, log ``i`` and row ``k`` each."""
+    known = [log.uncertainty for log in logs if log.uncertainty is not None]
+    if len(known) < len(logs):
+        return None
+    return np.stack([known[i][k].numpy() for i, k in found])
+
+
+def cut_for_fits(logs: Sequence[Log], horizon: int, *, history: int, most: int) -> Segments:
+    """Cut logs into the segments that fits, screens and figures are made on."""
+    return cut(
+        logs,
+        horizon,
+        history=history,
+        most=most,
+        checks=_CHECKS,
+        burn_in=history,
+        skip=_SKIP,
     )

@@ -30,6 +30,7 @@ from .segments import Segments
 
 Array = NDArray[np.float64]
 _WORST = 1e3  # innovations beyond this, and those of diverged simulations, count as this
+_KNOWN = 3.0  # times the error of an estimate that knows what it is to predict
 _DRAWS = 8  # simulated robots that the whitening is checked on
 _THIRD_DIFFERENCE = 20.0  # 1 + 9 + 9 + 1: variance of y₃ - 3y₂ + 3y₁ - y₀ per unit of white noise
 
@@ -95,18 +96,14 @@ def whitening(
             the time step and noise of its own; segments whose innovations are larger than one there
             (where the linear view of the start's noise fails) are trusted that much less.
     """
-    start = _start_noise(predictor, segments, noise)
-    moved = np.flatnonzero(start)
-    offsets = np.zeros((1 + 2 * len(moved), len(start)))
-    for i, coordinate in enumerate(moved):
-        offsets[1 + 2 * i, coordinate] = start[coordinate]
-        offsets[2 + 2 * i, coordinate] = -start[coordinate]
+    root = _start_noise(predictor, segments, noise)
+    offsets = np.concatenate([np.zeros_like(root[:1]), root, -root])
     thetas = np.repeat(theta[None], len(offsets), 0)
     residual = predictor.residuals(segments, thetas, None, offsets)
     finer = predictor.finer.residuals(segments, theta[None])
     size, checks, channels = residual.shape[1:]
     flat = np.nan_to_num(residual.reshape(len(offsets), size, -1))
-    plus, minus, nominal = flat[1::2], flat[2::2], flat[0]
+    plus, minus, nominal = flat[1 : 1 + len(root)], flat[1 + len(root) :], flat[0]
     slope, curve = (plus - minus) / 2, (plus + minus - 2 * nominal) / 2
     spread = np.einsum("jsm,jsn->smn", slope, slope) + np.einsum("jsm,jsn->smn", curve, curve)
     step = 2.0 * (nominal - np.nan_to_num(finer.reshape(size, -1)))
@@ -117,7 +114,9 @@ def whitening(
     lower = np.linalg.cholesky(spread)
     inverse = np.linalg.inv(lower)
     if generator is not None:
-        drawn = generator.standard_normal((_DRAWS, size, len(start))) * start
+        drawn = np.einsum(
+            "dsj,jsn->dsn", generator.standard_normal((_DRAWS, size, len(root))), root
+        )
         moved = predictor.residuals(segments, np.repeat(theta[None], _DRAWS, 0), None, drawn)
         made = moved - finer - (step / 2).reshape(finer.shape)
         made += noise * generator.standard_normal(moved.shape)
@@ -133,15 +132,29 @@ def whitening(
 
 
 def _start_noise(predictor: Predictor, segments: Segments, noise: Array) -> Array:
-    """Return how well each coordinate of the start state is known, shape ``(2 nv,)``."""
+    """Return steps of one standard deviation of the start states, ``(J, S, 2 nv)``.
+
+    Their squares sum up to the covariance.
+    """
     size = predictor.tangent.size
     start = np.zeros(2 * size)
     start[list(predictor.system.channel_index)] = noise
     # An estimated velocity knows of the rows that it is to predict: three times its noise leaves
     # the segment itself to say how fast it began.
-    estimated = 3.0 * segments.velocity_gain * start[:size]
+    estimated = _KNOWN * segments.velocity_gain * start[:size]
     start[size:] = np.maximum(start[size:], estimated)
-    return start
+    steps = np.diag(start)[start > 0]
+    steps = np.broadcast_to(steps[:, None], (len(steps), len(segments), 2 * size))
+    if segments.uncertainty is None:
+        return steps
+    # So does an estimated position.
+    asked = np.flatnonzero(segments.uncertainty.any((0, 1)))
+    some = segments.uncertainty[:, asked[:, None], asked]
+    variances = np.einsum("sii->si", some)
+    roots = np.zeros((len(segments), 2 * size, len(asked)))
+    safe = some + 1e-9 * np.einsum("si,ij->sij", variances, np.eye(len(asked)))
+    roots[:, asked] = _KNOWN * np.linalg.cholesky(safe)
+    return np.concatenate([steps, np.moveaxis(roots, -1, 0)])
 
 
 def noise_from_differences(logs: Sequence[Log], values: Sequence[Array]) -> Array:

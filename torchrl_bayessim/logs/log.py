@@ -24,6 +24,8 @@ class Log:
         measured: Which of the ``2 nv`` tangent coordinates were measured, boolean.
         first_row: The row of the file (from 0, without the header) where it begins; 0 means that
             the beginning of the trajectory is known.
+        uncertainty: Covariance of the errors of what was estimated and not measured, in the tangent
+            space, ``(T, 2 nv, 2 nv)``; nothing where all that matters was measured.
 
     All tensors of numbers are in double precision.
     """
@@ -36,6 +38,7 @@ class Log:
     velocity_gain: Tensor
     measured: Tensor
     first_row: int = 0
+    uncertainty: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.time)

@@ -19,26 +19,31 @@ TWO = """
       <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="{mass}"/></body></body>
 </worldbody><actuator><motor name="motor" joint="shoulder" ctrlrange="-5 5"/></actuator></mujoco>
 """
-COLUMNS = Columns(time="t", qpos={"shoulder": "q"}, qvel={"shoulder": "v"}, ctrl={"motor": "u"})
+ROWS = 160
+COLUMNS = Columns("t", {"shoulder": ("q",)}, {"shoulder": ("v",)}, {"motor": "u"})
+FEW = ["coulomb_friction", "viscous_friction", "action_gain", "constant_force"]
 
 
-def recorded(mass):
+def recorded(mass, noise=0.003, friction=(0.0, 0.0)):
     """Return a system of which the elbow is not logged, and runs of it."""
     model = mujoco.MjModel.from_xml_string(TWO.format(mass=mass))
+    real = mujoco.MjModel.from_xml_string(TWO.format(mass=mass))
+    real.dof_frictionloss[:] = friction
     rng, logs = np.random.default_rng(0), []
     for i in range(4):
-        data, rows = mujoco.MjData(model), []
-        wave = rng.uniform(1, 4) * np.sin(0.02 * rng.uniform(1, 6) * np.arange(100))
+        data, rows = mujoco.MjData(real), []
+        wave = rng.uniform(1, 4) * np.sin(0.02 * rng.uniform(1, 6) * np.arange(ROWS))
+        data.qpos[1] = rng.normal(scale=0.3)
         for u in wave:
             rows.append((*data.qpos, *data.qvel))
             data.ctrl[:] = u
-            mujoco.mj_step(model, data, 4)
-        state = torch.tensor(np.array(rows)) + 0.003 * torch.from_numpy(rng.normal(size=(100, 4)))
+            mujoco.mj_step(real, data, 4)
+        state = torch.tensor(np.array(rows)) + noise * torch.from_numpy(rng.normal(size=(ROWS, 4)))
         state[:, [1, 3]] = 0.0
         logs.append(
             Log(
                 name=f"run{i}",
-                time=0.02 * torch.arange(100).double(),
+                time=0.02 * torch.arange(ROWS).double(),
                 qpos=state[:, :2],
                 qvel=state[:, 2:],
                 ctrl=torch.from_numpy(wave)[:, None],
@@ -49,9 +54,25 @@ def recorded(mass):
     return System(task=Task(model=model, frame_skip=4), columns=COLUMNS), logs
 
 
-def test_a_joint_that_moves_what_is_measured_must_be_logged():
+def test_a_simulator_that_is_right_needs_nothing_though_a_joint_was_not_logged():
     system, logs = recorded(mass=0.5)
-    with pytest.raises(ValueError, match=r"expected positions of all joints .* 'none of elbow'"):
+    report = diagnose(system, None, logs, effects=FEW)
+    assert report.verdict == "none"
+    assert report.gap.raw < 1.5
+    assert "elbow was not logged" in report.alarms[0]
+
+
+def test_friction_of_a_joint_that_was_not_logged_is_named():
+    system, logs = recorded(mass=0.5, friction=(0.0, 0.05))
+    report = diagnose(system, None, logs, effects=FEW)
+    assert (report.effects[0].name, report.effects[0].where) == ("coulomb_friction", "elbow")
+    assert report.effects[0].strength == pytest.approx(0.05, rel=0.2)
+    assert report.gap.explained_fraction > 0.8
+
+
+def test_a_joint_of_which_the_measurements_say_too_little_must_be_logged():
+    system, logs = recorded(mass=0.005, noise=0.001)
+    with pytest.raises(ValueError, match=r"say what elbow did .* leave it open.*log the position"):
         diagnose(system, None, logs, effects=["coulomb_friction"])
 
 

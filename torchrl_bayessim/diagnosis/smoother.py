@@ -1,0 +1,241 @@
+r"""What the state was at every row of a log, from what was measured of it: a filter and a smoother.
+
+States follow the simulator with unknown forces of white noise, and the measured coordinates are
+seen with noise:
+
+.. math::  x_{t+1} = f(x_t, u_t) + w_t, \qquad y_t = H x_t + v_t.
+
+The divided-difference filter (Nørgaard, Poulsen & Ravn 2000) carries mean and covariance
+:math:`P = S S^\top` forward; in place of derivatives it simulates one standard deviation to both
+sides of every direction, :math:`d_j = (f(x + s_j) - f(x - s_j)) / 2`, so that
+:math:`P_{t+1|t} = \sum_j d_j d_j^\top + Q`. The smoother (Rauch, Tung & Striebel 1965) goes back
+with the gain :math:`G_t = (\sum_j s_j d_j^\top) P_{t+1|t}^{-1}`. Many logs, under many
+hypotheses, are one batch.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Beliefs", "Filtered", "filtered", "smoothed"]
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..logs.log import Log
+from .prediction import Predictor
+from .segments import Segments
+
+Array = NDArray[np.float64]
+_TINY = 1e-10  # of the variance: keeps covariances positive definite
+_LOST = 1e6  # squared innovation, in units of its variance, of a simulation that diverged
+
+
+@dataclass(frozen=True, eq=False)
+class Beliefs:
+    """Mean and covariance of ``N`` states.
+
+    Attributes:
+        qpos: Positions, shape ``(N, nq)``.
+        qvel: Velocities, shape ``(N, nv)``.
+        covariance: In the tangent space, shape ``(N, 2 nv, 2 nv)``; zero where nothing is asked.
+    """
+
+    qpos: Array
+    qvel: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Filtered:
+    """What a filter leaves for the smoother.
+
+    Attributes:
+        likelihood: Log density of each log's measurements, shape ``(N,)``.
+        beliefs: After each row's measurement, length ``T``.
+        predicted: Before it, by row; of the first row what was given.
+        gains: Of the smoother, from each row to the one before.
+    """
+
+    likelihood: Array
+    beliefs: list[Beliefs] = field(default_factory=list)
+    predicted: list[Beliefs] = field(default_factory=list)
+    gains: list[Array] = field(default_factory=list)
+
+
+def filtered(
+    predictor: Predictor,
+    logs: Sequence[Log],
+    first: Beliefs,
+    *,
+    theta: Array,
+    forces: Array,
+    noise: Array,
+    rows: int | None = None,
+    keep: bool = True,
+) -> Filtered:
+    """Run the filter along logs.
+
+    Args:
+        predictor: Simulates.
+        logs: One per belief.
+        first: Before the first measurement; coordinates without variance keep their values.
+        theta: Parameters, shape ``(D,)``.
+        forces: Covariance of what unknown forces add within a control step, ``(N, 2 nv, 2 nv)``.
+        noise: Standard deviation of each channel's noise, shape ``(C,)``.
+        rows: At most so many.
+        keep: Whether to keep what the smoother needs, and not only the likelihood.
+    """
+    length = min(rows or 10**9, max(len(log) for log in logs))
+    asked = np.diagonal(first.covariance, axis1=1, axis2=2) > 0
+    forces = forces * (asked[:, :, None] & asked[:, None, :])
+    dynamics = _Dynamics(predictor, _Record(logs, length), theta, forces, noise)
+    result = Filtered(np.zeros(len(logs)))
+    belief = first
+    for t in range(length):
+        if keep:
+            result.predicted.append(belief)
+        belief, density = dynamics.measured(belief, t)
+        result.likelihood[:] += np.where(dynamics.record.alive[:, t], density, 0.0)
+        if keep:
+            result.beliefs.append(belief)
+        if t + 1 < length:
+            belief, gain = dynamics.moved(belief, t)
+            if keep:
+                result.gains.append(gain)
+    return result
+
+
+def smoothed(predictor: Predictor, run: Filtered, lengths: Sequence[int]) -> list[Beliefs]:
+    """Return what is believed of every row after all measurements of its log, length ``T``.
+
+    Args:
+        predictor: Knows the tangent space.
+        run: Of the filter.
+        lengths: Of the logs.
+    """
+    last = np.array(lengths) - 1
+    later = run.beliefs[-1]
+    result = [later]
+    for t in range(len(run.beliefs) - 2, -1, -1):
+        now, expected, gain = run.beliefs[t], run.predicted[t + 1], run.gains[t]
+        known = (t < last)[:, None] * 1.0
+        step = known * np.einsum("nij,nj->ni", gain, _apart(predictor, expected, later))
+        excess = later.covariance - expected.covariance
+        covariance = now.covariance + known[..., None] * (gain @ excess @ gain.swapaxes(1, 2))
+        later = _displaced(predictor, now, step, _symmetric(covariance))
+        result.append(later)
+    return result[::-1]
+
+
+class _Record:
+    """Logs side by side; the shorter ones stand still at their ends."""
+
+    def __init__(self, logs: Sequence[Log], length: int) -> None:
+        def padded(name: str) -> Array:
+            parts = [getattr(log, name).numpy() for log in logs]
+            return np.stack([p[np.minimum(np.arange(length), len(p) - 1)] for p in parts])
+
+        self.time, self.ctrl = padded("time"), padded("ctrl")
+        self.qpos, self.qvel = padded("qpos"), padded("qvel")
+        self.alive = np.arange(length) < np.array([len(log) for log in logs])[:, None]
+
+    def step(self, belief: Beliefs, t: int) -> Segments:
+        """Return segments of one control step from what is believed."""
+
+        def twice(values: Array) -> Array:
+            return np.repeat(values[:, None], 2, axis=1)
+
+        none = np.zeros(len(self.time), dtype=np.int64)
+        return Segments(
+            horizon=1,
+            history=0,
+            checked=np.ones(1, dtype=np.int64),
+            log=none,
+            start=none,
+            time=twice(self.time[:, t]),
+            qpos=twice(belief.qpos),
+            qvel=twice(belief.qvel),
+            ctrl=twice(self.ctrl[:, t]),
+            velocity_gain=np.zeros(belief.qvel.shape[1]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Dynamics:
+    """How states follow one another, and what is seen of them."""
+
+    predictor: Predictor
+    record: _Record
+    theta: Array
+    forces: Array
+    noise: Array
+
+    def measured(self, belief: Beliefs, t: int) -> tuple[Beliefs, Array]:
+        """Return the belief after row ``t``, and the log density of that row."""
+        record, channels = self.record, self.predictor.sensing.channels
+        position = self.predictor.tangent.difference(belief.qpos, record.qpos[:, t])
+        both = np.concatenate([position, record.qvel[:, t] - belief.qvel], -1)
+        innovation = np.nan_to_num(both[:, channels])
+        seen = belief.covariance[:, channels]
+        spread = seen[:, :, channels] + np.diag(self.noise**2)
+        inverse = np.linalg.inv(spread)
+        gain = seen.swapaxes(1, 2) @ inverse
+        step = np.einsum("nij,nj->ni", gain, innovation)
+        distance = np.einsum("ni,nij,nj->n", innovation, inverse, innovation)
+        density = -0.5 * (np.minimum(distance, _LOST) + np.linalg.slogdet(spread)[1])
+        covariance = _symmetric(belief.covariance - gain @ seen)
+        return _displaced(self.predictor, belief, step, covariance), density
+
+    def moved(self, belief: Beliefs, t: int) -> tuple[Beliefs, Array]:
+        """Return the belief one control step later, and the smoother's gain."""
+        asked = np.flatnonzero(belief.covariance.any((0, 2)))
+        every = np.arange(len(belief.qpos))
+        part = np.ix_(every, asked, asked)
+        root = np.zeros((*belief.covariance.shape[:2], len(asked)))
+        root[:, asked] = np.linalg.cholesky(_positive(belief.covariance[part]))
+        middle, change = self._stepped(belief, root, t)
+        fixed = np.ones(2 * self.predictor.tangent.size, dtype=bool)
+        fixed[asked] = False
+        change[:, fixed] = 0.0
+        covariance = _symmetric(change @ change.swapaxes(1, 2) + self.forces)
+        gain = np.zeros_like(covariance)
+        inverse = np.linalg.inv(_positive(covariance[part]))
+        gain[part] = root[:, asked] @ change[:, asked].swapaxes(1, 2) @ inverse
+        back = np.where(fixed, _apart(self.predictor, middle, belief), 0.0)
+        return _displaced(self.predictor, middle, back, covariance), gain
+
+    def _stepped(self, belief: Beliefs, root: Array, t: int) -> tuple[Beliefs, Array]:
+        """Return the mean one control step later, and what a step along each column becomes."""
+        columns = np.moveaxis(root, -1, 0)
+        offsets = np.concatenate([np.zeros_like(columns[:1]), columns, -columns])
+        thetas = np.repeat(self.theta[None], len(offsets), 0)
+        states = self.predictor.states(self.record.step(belief, t), thetas, None, offsets)
+        qpos, qvel = (part[:, :, 0] for part in states)
+        fine = np.isfinite(np.concatenate([qpos, qvel], -1)).all((0, 2)).reshape(-1, 1)
+        qpos, qvel = np.where(fine, qpos, belief.qpos), np.where(fine, qvel, belief.qvel)
+        turned = self.predictor.tangent.difference(qpos[:1], qpos)
+        away = np.concatenate([turned, qvel - qvel[:1]], -1)[1:]
+        change = (away[: len(columns)] - away[len(columns) :]) / 2
+        return Beliefs(qpos[0], qvel[0], belief.covariance), np.moveaxis(change, 0, -1)
+
+
+def _apart(predictor: Predictor, a: Beliefs, b: Beliefs) -> Array:
+    return np.concatenate([predictor.tangent.difference(a.qpos, b.qpos), b.qvel - a.qvel], -1)
+
+
+def _displaced(predictor: Predictor, belief: Beliefs, step: Array, covariance: Array) -> Beliefs:
+    half = predictor.tangent.size
+    qpos = predictor.tangent.displace(belief.qpos, step[:, :half])
+    return Beliefs(qpos, belief.qvel + step[:, half:], covariance)
+
+
+def _symmetric(matrices: Array) -> Array:
+    return (matrices + matrices.swapaxes(1, 2)) / 2
+
+
+def _positive(matrices: Array) -> Array:
+    """Return the same with variances a little larger, so that roots exist."""
+    variances = np.einsum("nii->ni", matrices)
+    return matrices + _TINY * np.einsum("ni,ij->nij", variances, np.eye(matrices.shape[1]))
