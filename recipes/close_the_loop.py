@@ -26,7 +26,6 @@ from close_the_loop_report import SOURCES, draw_figure, summarised, table
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 from tqdm.auto import tqdm
-from training import single_thread
 
 from torchrl_bayessim.agents.ppo import PPO
 from torchrl_bayessim.diagnosis.diagnose import diagnose
@@ -67,7 +66,6 @@ class CloseTheLoop(recipe.Settings):
 
 def job(settings: CloseTheLoop, out: Path) -> dict[str, Any]:
     """Diagnose on every seed; then infer, train and score under both simulators."""
-    single_thread()
     if settings.seeds < 2:
         raise ValueError(message("at least 2 seeds, for an interval", settings.seeds))
     if settings.short:

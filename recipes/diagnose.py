@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import recipe
-import torch
 from tqdm import tqdm
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
@@ -48,7 +47,6 @@ class Diagnosis(recipe.Settings):
 
 def job(settings: Diagnosis, out: Path) -> dict[str, Any]:
     """Read, check, diagnose, and write the report."""
-    torch.set_num_threads(1)  # simulations have threads of their own
     system, logs, findings = read(settings)
     with stages(shown=settings.progress) as progress:
         report = diagnose(

@@ -83,7 +83,7 @@ def job(settings: Recovery, out: Path) -> dict[str, Any]:
     todo = [(name, seed) for seed in seeds for name in names]
     folder = out / "parts"
     folder.mkdir(exist_ok=True)
-    with workers(settings.processes) as pool:
+    with workers(settings.processes, threads=settings.threads) as pool:
         jobs = [pool.submit(run, settings, name, seed, folder) for name, seed in todo]
         parts = []
         for (name, seed), done in zip(todo, jobs, strict=True):
@@ -166,7 +166,6 @@ def run(settings: Recovery, name: str, seed: int, folder: Path) -> dict[str, Any
     kept = folder / f"{name}_{protocol}_{settings.simulations}_{settings.truths}_{seed}.json"
     if kept.exists():
         return json.loads(kept.read_text())
-    torch.set_num_threads(1)
     start = time.perf_counter()
     problem = PROBLEMS[name]
     prior = problem.prior

@@ -43,6 +43,7 @@ class Settings:
 
     seed: int = 0
     out: str = ""  # folder; outputs/NAME/TIME by default
+    threads: int = 1  # of torch, for which batches are small; simulations have their own
     progress: bool = True
     debug: bool = False
 
@@ -62,6 +63,7 @@ def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> No
     made: list[Path] = []
     try:
         settings = parse(settings_type, sys.argv[1:])
+        torch.set_num_threads(settings.threads)
         folder = Path(settings.out or f"outputs/{name}/{datetime.now():%Y-%m-%d_%H-%M-%S}")
         made = opened(folder)
         if hasattr(settings, "resume"):
@@ -167,6 +169,8 @@ def parse(settings_type: type[S], arguments: list[str]) -> S:
     settings: Any = OmegaConf.to_object(given)
     if not 0 <= settings.seed < SEEDS:
         raise ValueError(message(f"a seed from 0 to {SEEDS - 1}", settings.seed))
+    if settings.threads < 1:
+        raise ValueError(message("threads to be positive", settings.threads))
     keys = [argument.partition("=")[0] for argument in arguments]
     return resumed(settings, keys) if getattr(settings, "resume", "") else settings
 

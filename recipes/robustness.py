@@ -28,7 +28,6 @@ from robustness_report import compared, curves, draw_pictures, table
 from robustness_study import Study, nominal
 from tasks import TASKS, Task
 from torch import Tensor
-from training import single_thread
 
 from torchrl_bayessim.errors import message
 from torchrl_bayessim.whole_file import write_text
@@ -73,7 +72,6 @@ class Robustness(recipe.Settings):
 
 def job(settings: Robustness, out: Path) -> dict[str, Any]:
     """Train every policy, score all, compare and draw."""
-    single_thread()
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     if settings.short:
         settings.simulations, settings.episodes = 24, 2

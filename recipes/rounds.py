@@ -11,6 +11,7 @@ import recipe
 import torch
 from tasks import Task
 from torch import Tensor
+from torchrl.record.loggers import Logger
 
 from torchrl_bayessim import plots
 from torchrl_bayessim.inference.physics_posterior import PhysicsPosterior
@@ -20,17 +21,30 @@ from torchrl_bayessim.whole_file import write_text
 
 
 class Journal:
-    """What each round gave, kept beside the checkpoint so that a resumed run reports them all."""
+    """What each round gave, kept beside the checkpoint so that a resumed run reports them all.
 
-    def __init__(self, path: Path, *, resume: bool) -> None:
-        self.path = path
+    A logger, if there is one, is told everything again: it begins anew in every process.
+    """
+
+    def __init__(self, path: Path, *, resume: bool, logger: Logger | None = None) -> None:
+        self.path, self.logger = path, logger
         resume = resume and path.exists()  # not before the end of the first round
         self.rounds: list[dict[str, Any]] = json.loads(path.read_text()) if resume else []
+        for entry in self.rounds:
+            self._log(entry)
 
     def add(self, index: int, entry: dict[str, Any]) -> None:
         """Keep the entry of round ``index``, which may be told twice after a break."""
+        if index == len(self.rounds):
+            self._log(entry)
         self.rounds = [*self.rounds[:index], entry]
         write_text(self.path, json.dumps(recipe.plain(self.rounds)))
+
+    def _log(self, entry: dict[str, Any]) -> None:
+        for point in entry["curve"] if self.logger else ():
+            for name, value in point.items():
+                number = math.nan if value is None else value
+                self.logger.log_scalar(f"train/{name}", number, step=int(point["frames"]))
 
 
 def describe(

@@ -24,7 +24,7 @@ from rounds import Journal, compare, describe, draw_pictures, sentence, shown
 from scipy.stats import binomtest
 from tasks import true_parameters
 from torch import Tensor
-from training import Plan, Trained, single_thread, train
+from training import Plan, Trained, train
 from video import record
 
 from torchrl_bayessim import checkpoint
@@ -65,7 +65,6 @@ class Sim2RealFetch(recipe.Settings):
 
 def job(settings: Sim2RealFetch, out: Path) -> dict[str, Any]:
     """Train the collecting policy, run the loop and its baseline, score them, draw pictures."""
-    single_thread()
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     task = chosen(settings)
     truth = true_parameters(task, settings.truth, seed=settings.seed)
@@ -125,7 +124,7 @@ def chosen(settings: Sim2RealFetch) -> GoalTask:
     warmup, updates = settings.warmup or task.warmup, settings.updates or task.updates
     if settings.short:
         settings.simulations, settings.episodes = min(settings.simulations, 48), 2
-        warmup, updates = 2, 2
+        warmup, updates = settings.warmup or 2, settings.updates or 2
         ddpg |= {"hidden": (32, 32), "batch_size": 64, "updates_per_frame": 0.02}
         task = replace(task, environments=8, shared_batches=1)
     return replace(task, warmup=warmup, updates=updates, ddpg=ddpg)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import shutil
 from dataclasses import dataclass
 from importlib.util import find_spec
 from multiprocessing import active_children
@@ -19,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import recipe
-import torch
 from rounds import Journal, compare, confidence, describe, draw_pictures, sentence, shown
 from tasks import TASKS, Task, true_parameters
 from torch import Tensor
@@ -60,7 +60,6 @@ class Sim2Real(recipe.Settings):
 
 def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
     """Run the loop and its baseline, score both at the robot, and draw the pictures."""
-    torch.set_num_threads(1)  # batches are small: a second thread only costs
     task = chosen(settings)
     if settings.short:
         settings.simulations = min(settings.simulations, 192)
@@ -68,10 +67,12 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
     truth = true_parameters(task, settings.truth, seed=settings.seed)
     score = Score(task, truth, episodes=16 if settings.short else 100)
     check_logger(settings.logger)
+    shutil.rmtree(out / "log", ignore_errors=True)  # of a broken run, which is logged again
     logger = get_logger(settings.logger, logger_name=str(out), experiment_name="log")
 
     loop, learner = make_loop(task, truth, settings, out)
-    done = Journal(out / "rounds.json", resume=loop.resume() if settings.resume else False)
+    resumed = loop.resume() if settings.resume else False
+    done = Journal(out / "rounds.json", resume=resumed, logger=logger)
     print(f"{settings.task}: {task.prior}")
     for name in idle(task):
         print(f"note: {name} changes nothing that is observed, so no data can tell it")
@@ -79,9 +80,6 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
         for turn in loop:
             earned = confidence(score(learner.policy))
             done.add(turn.index, describe(turn, task, truth, real=earned))
-            for entry in turn.curve:
-                for name, value in entry.items():
-                    logger.log_scalar(f"train/{name}", value, step=int(entry["frames"]))
             said = f"the robot earns {shown(*earned)}"
             print(sentence(turn, task, done.rounds[-1], said=said))
         result: dict[str, Any] = {
@@ -187,7 +185,7 @@ class Baseline:
     """The same PPO under the prior, with as many frames, in a process beside the loop."""
 
     def __init__(self, settings: Sim2Real, *, frames: int) -> None:
-        self.pool = workers(1)
+        self.pool = workers(1, threads=settings.threads)
         if settings.baseline:
             self.future = self.pool.submit(train_under_prior, settings, frames=frames)
 
@@ -209,7 +207,6 @@ def train_under_prior(
     settings: Sim2Real, *, frames: int
 ) -> tuple[dict[str, Tensor], list[dict[str, float]]]:
     """Return the weights of a policy learned under the prior, and its learning curve."""
-    torch.set_num_threads(1)
     task = chosen(settings)
     env = task.make(task.environments, seed=settings.seed, randomizer=DomainRandomizer(task.prior))
     learner = PPO(env, seed=settings.seed, **task.ppo)

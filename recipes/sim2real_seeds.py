@@ -4,7 +4,7 @@
 
 Runs ``sim2real_ppo.py`` once per seed (two at a time), and writes result.json and table.md: nats
 over the prior per parameter and round, and the return at the robot against training under the
-prior.
+prior. ``resume=FOLDER`` goes on after a break.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ class Seeds(recipe.Settings):
     updates: int = 0  # PPO updates per round; 0 for the task's own number
     short: bool = False
     processes: int = 2
+    resume: str = ""  # folder of a run that was broken off
 
 
 def job(settings: Seeds, out: Path) -> dict[str, Any]:
@@ -82,14 +83,19 @@ def one(settings: Seeds, out: Path, seed: int) -> dict[str, Any]:
         "updates": settings.updates,
         "short": settings.short,
         "seed": seed,
+        "threads": settings.threads,
         "out": folder,
-        "progress": False,
     }
+    if (folder / "settings.json").exists():
+        arguments = {"resume": folder}
     command = [sys.executable, str(script), *(f"{k}={v}" for k, v in arguments.items())]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SimulationError(f"seed {seed} failed: {done.stderr.strip().splitlines()[-1]}")
-    run = json.loads((folder / "result.json").read_text())
+    file = folder / "result.json"
+    if not file.exists():
+        command.append("progress=false")
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise SimulationError(f"seed {seed} failed: {done.stderr.strip().splitlines()[-1]}")
+    run = json.loads(file.read_text())
     return {key: run[key] for key in ("parameters", "true", "rounds", "baseline", "gain")}
 
 

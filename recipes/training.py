@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from tqdm.auto import tqdm
 
 from torchrl_bayessim import checkpoint
@@ -176,8 +175,3 @@ def thinned(curve: list[dict[str, float]], points: int) -> list[dict[str, float]
         before = shown[-1]["return"] if shown else float("nan")
         shown.append({**stretch[-1], "return": sum(ended) / len(ended) if ended else before})
     return shown
-
-
-def single_thread() -> None:
-    """Use one thread: batches are small, and a second thread would only wait."""
-    torch.set_num_threads(1)

@@ -28,7 +28,6 @@ from typing import Any
 
 import numpy as np
 import recipe
-import torch
 from tqdm import tqdm
 from withheld import cases, folders, page, plans, scoring
 from withheld.shrinkage import true_shrinkage
@@ -62,7 +61,6 @@ class Withheld(recipe.Settings):
 
 def job(settings: Withheld, out: Path) -> dict[str, Any]:
     """Generate, seal, diagnose, open, score."""
-    torch.set_num_threads(1)
     usual, counts = SHORT if settings.short else FULL
     robots = (settings.robots or usual).split(",")
     unknown = [name for name in robots if name not in cases.ROBOTS]

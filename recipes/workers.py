@@ -7,15 +7,18 @@ import threading
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context, parent_process
 
+import torch
 
-def workers(count: int) -> ProcessPoolExecutor:
-    """Return a pool of ``count`` processes of their own interpreters."""
+
+def workers(count: int, *, threads: int) -> ProcessPoolExecutor:
+    """Return a pool of ``count`` processes of their own interpreters, each of so many threads."""
     spawn = get_context("spawn")
-    return ProcessPoolExecutor(count, mp_context=spawn, initializer=end_with_parent)
+    return ProcessPoolExecutor(count, mp_context=spawn, initializer=begin, initargs=(threads,))
 
 
-def end_with_parent() -> None:
-    """End this process when its parent does."""
+def begin(threads: int) -> None:
+    """Set the threads of this process, and end it when its parent ends."""
+    torch.set_num_threads(threads)
     parent = parent_process()
     assert parent is not None  # it was spawned
 
