@@ -37,3 +37,16 @@ def test_a_resumed_journal_logs_every_round_once(journal, tmp_path):
     assert len(again.rounds) == 3
     anew = journal("anew", resume=False)
     assert anew.rounds == []
+
+
+def test_tensorboard_is_told_the_same(journal, tmp_path):
+    pytest.importorskip("tensorboard")
+    from rounds import Journal
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    logger = get_logger("tensorboard", logger_name=str(tmp_path), experiment_name="log")
+    told = Journal(tmp_path / "rounds.json", resume=False, logger=logger)
+    told.add(0, entry(1.5, 2.5))
+    logger.experiment.close()
+    events = EventAccumulator(str(tmp_path / "log")).Reload()
+    assert [(e.step, e.value) for e in events.Scalars("train/return")] == [(0, 1.5), (8, 2.5)]

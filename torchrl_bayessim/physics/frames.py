@@ -35,7 +35,7 @@ def separate(model: mujoco.MjModel, field: str, row: int) -> None:
         >>> model = mujoco.MjModel.from_xml_string(
         ...     "<mujoco><worldbody><body><geom size='.1'/></body></worldbody></mujoco>")
         >>> separate(model, "geom_pos", 0)
-        >>> model.geom_sameframe[0] == mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+        >>> bool(model.geom_sameframe[0] == mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
         True
     """
     if field not in _FLAGS:

@@ -1,0 +1,51 @@
+"""The command that tests the declared versions: what it pins, and that nothing is left out."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture
+def versions(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "recipes/benchmarks")
+    import versions
+
+    return versions
+
+
+def test_low_pins_every_lower_bound_and_high_none(versions):
+    pins = list(versions.constraints("low", {"torch": "2.13.0"}))
+    assert pins[-1] == "torch==2.13.0"
+    names = [versions.package(line) for line in pins]
+    asked = versions.requirements(*versions.EXTRAS)
+    assert sorted(names) == sorted({versions.package(line) for line in asked})
+    for line in asked:
+        if not line.startswith("torch>"):
+            assert line.split(",")[0].replace(">=", "==") in pins
+    assert list(versions.constraints("high", {})) == []
+
+
+def test_every_extra_has_its_environment_and_every_test_exists(versions):
+    assert set(versions.EXTRAS) - {"test"} <= versions.ENVIRONMENTS.keys()
+    for extras, _, tests in versions.ENVIRONMENTS.values():
+        assert set(filter(None, extras.split(","))) <= versions.EXTRAS.keys()
+        assert all((ROOT / test).exists() for test in tests.split())
+
+
+def test_an_unknown_environment_is_refused(versions):
+    with pytest.raises(SystemExit, match=r"expected environments \['low'.*got \['lwo'\]"):
+        versions.main("lwo")
+
+
+def test_a_step_that_fails_says_how(versions, tmp_path):
+    steps = {
+        "install": [sys.executable, "-c", "print('done')"],
+        "import": [sys.executable, "-c", "import no_such_module"],
+    }
+    found = versions.run(steps, tmp_path)
+    assert found["failed"] == "import"
+    assert found["said"][-1] == "ModuleNotFoundError: No module named 'no_such_module'"
+    assert versions.run({"tests": steps["install"]}, tmp_path)["tests"] == "done"
