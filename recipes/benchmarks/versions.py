@@ -44,7 +44,7 @@ OF_EXTRA = {
 ENVIRONMENTS = {
     "low": ("recipes", "matplotlib omegaconf pyarrow", " ".join(SMOKE)),
     "high": ("recipes", "matplotlib omegaconf pyarrow", " ".join(SMOKE)),
-    "bare": ("", "", " ".join(SMOKE)),
+    "bare": ("", "", " ".join([*SMOKE, "--ignore=torchrl_bayessim/plots.py"])),
     **OF_EXTRA,
 }
 IMPORTS = """
