@@ -87,6 +87,9 @@ def test_the_last_bit_counts_and_times_and_paths_do_not(modules, tmp_path):
     assert outputs.differing(one, same) == []
     assert outputs.differing(one, other) == ["policy.pt/weight", "result.json/real/0"]
     assert outputs.differing(one, one | {"more.json": 0}) == ["more.json"]
+    assert outputs.apart(one, same) == {}
+    assert outputs.apart(one, other) == {"real": pytest.approx(2**-23, rel=0.05)}
+    assert outputs.apart(one, {}) == {"real": np.inf}
 
 
 @pytest.mark.parametrize("name", ["policy.pt", "result.json"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["differing", "read", "unfinished"]
+__all__ = ["apart", "differing", "read", "unfinished"]
 
 import json
 from collections.abc import Iterator
@@ -34,6 +34,29 @@ def read(folder: Path) -> dict[str, Any]:
 def differing(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
     """Return where two runs differ, in files, entries or numbers."""
     return sorted(k for k in one.keys() | other.keys() if one.get(k, _NONE) != other.get(k, _NONE))
+
+
+def apart(one: dict[str, Any], other: dict[str, Any]) -> dict[str, float]:
+    """Return how far numbers of two result.json are apart, |a - b| / max(|a|, |b|), by name.
+
+    Only those that differ; of a list, the largest. What is no number in both counts as infinity.
+    """
+    far: dict[str, float] = {}
+    for place in differing(one, other):
+        file, *names = place.split("/")
+        if file == "result.json":
+            name = next((n for n in reversed(names) if not n.isdecimal()), place)
+            ratio = _ratio(one.get(place), other.get(place))
+            far[name] = max(far.get(name, 0.0), float(f"{ratio:.2g}"))
+    return far
+
+
+def _ratio(one: Any, other: Any) -> float:
+    try:
+        a, b = (float.fromhex(v) if isinstance(v, str) else float(v) for v in (one, other))
+    except (TypeError, ValueError):
+        return float("inf")
+    return abs(a - b) / (max(abs(a), abs(b)) or 1.0)  # zeros of two signs
 
 
 def unfinished(folder: Path) -> list[Path]:

@@ -1,0 +1,85 @@
+"""Same seed, same machine: the same numbers? And what do more threads change?
+
+Every recipe in its short setting three times: with one thread of torch and simulations on all
+cores; again on one core, which must give the same numbers, bit for bit and without times and paths;
+and with two threads of torch, which add in another order: how far the numbers of result.json are
+then apart. Prints one JSON line per recipe (half an hour on two busy cores)::
+
+    python recipes/benchmarks/repeated.py [sim2real_ppo ...]
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from killed import RECIPES, Case, run
+from measuring import report
+from outputs import apart, differing, read
+
+SETTINGS = {
+    "sim2real_ppo": ("short=true",),
+    "sim2real_seeds": ("short=true", "seeds=2"),
+    "sim2real_ddpg_her": ("short=true",),
+    "posterior_recovery": ("short=true",),
+    "robustness": ("short=true", "seeds=2"),
+    "close_the_loop": ("short=true", "seeds=2"),
+    "withheld_effects": ("robots=arm", "tiers=T0=1,T1=1", "seed=5"),
+    "diagnose": (),
+}
+
+
+def made(name: str, folder: Path) -> Case:
+    """Return a recipe with its short setting; with a robot's logs, if it needs them."""
+    settings = SETTINGS[name]
+    if name == "diagnose":
+        sys.path.append(str(RECIPES))
+        from withheld import cases, folders
+
+        case = cases.make(cases.Plan("T1", "arm", ("coulomb_friction",)), np.random.default_rng(0))
+        for file, text in folders.handed_over(case).items():
+            (folder / file).write_text(text)
+        settings = (f"system={folder}/system.yaml", f"data={folder}")
+    return Case(RECIPES / f"{name}.py", settings)
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Let what is started here run on one of the cores."""
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
+def repeat(case: Case, folder: Path) -> tuple[int, list[str], dict[str, float]]:
+    """Return how many entries a run has, where a second one differs, and two threads how far."""
+    run(case, folder / "first")
+    with one_core():
+        run(case, folder / "again")
+    run(replace(case, settings=(*case.settings, "threads=2")), folder / "threads")
+    first, again, threads = (read(folder / name) for name in ("first", "again", "threads"))
+    return len(first), differing(first, again), apart(first, threads)
+
+
+def main(*names: str) -> None:
+    """Repeat the recipes in turn."""
+    for name in names or SETTINGS:
+        with tempfile.TemporaryDirectory() as folder:
+            data = Path(folder, "data")
+            data.mkdir()
+            entries, differ, far = repeat(made(name, data), Path(folder))
+        told = {"entries": entries, "differing": differ, "two_threads": far}
+        report("repeated", name, [len(differ)], unit="entries", seed=0, threads=1, **told)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
