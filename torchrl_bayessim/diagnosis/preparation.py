@@ -148,11 +148,12 @@ def prepare(
         )
     history = min(max(8, round(_HISTORY / system.control_dt)), 100)
     parts = _completed(predictor, system, parts, history=history, alarms=alarms)
+    some = cut(parts["train"], min(_STEPS, shortest // 2), history=history, most=_FEW)
+    noise = assumed_noise(system, predictor, parts["train"])
+    predictor = with_fewest_steps(predictor, some, units, z=origin(system.prior), noise=noise)
     noise, source = measured_noise(
         system, predictor, parts["train"], history=history, alarms=alarms
     )
-    some = cut(parts["train"], min(_STEPS, shortest // 2), history=history, most=_FEW)
-    predictor = with_fewest_steps(predictor, some, units, z=origin(system.prior), noise=noise)
     if horizon is None:
         horizon = chosen_horizon(
             predictor, system, parts["train"], units=units, noise=noise, history=history
