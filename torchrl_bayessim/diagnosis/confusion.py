@@ -13,7 +13,8 @@ from .model import Model, as_good
 from .objective import Objective
 from .selection import Selection, parts
 
-_FORM = 0.01  # of what an effect explains: how well the form of its law is known
+_LAST = 0.01  # of what an effect explains: too little to prefer one law to another
+_FORM = 0.1  # of the same: how well the form of a law is known
 
 
 def confusion_set(selection: Selection, name: str) -> tuple[str, ...]:
@@ -26,12 +27,15 @@ def confusion_set(selection: Selection, name: str) -> tuple[str, ...]:
     Nason 2011) and the likelihood says so too.
 
     Beside other effects, what acts like it is compared alone too, without their help: they were
-    found next to it. The first name is the effect's own.
+    found next to it. What acts like it belongs to the set as well if it explains nearly as much, or
+    much of what the effect leaves: the cause may have neither's form. The first name is the
+    effect's own.
     """
     own = {unit.name for unit in selection.best.units}
-    others = [stand_in(selection, rival) for rival in rivals(selection, name)]
+    others = [stand_in(selection, rival) for rival in rivals(selection, name, form=_FORM)]
     if len(own) > 1:
         others += _alike_alone(selection, name)
+    others += _alike_beside(selection, name)
     return tuple(dict.fromkeys([name, *(other for other in others if other not in own)]))
 
 
@@ -48,6 +52,26 @@ def _alike_alone(selection: Selection, name: str) -> list[str]:
     ]
 
 
+def _alike_beside(selection: Selection, name: str) -> list[str]:
+    """Return what acts like an effect and, beside it, explains much that it leaves."""
+    best = selection.best
+    groups = {unit.effect.group for unit in best.units if unit.name == name}
+    found = []
+    for model in selection.tried:
+        added = [unit for unit in model.units if unit not in best.units]
+        beside = len(model.units) == len(best.units) + len(added)
+        if beside and {unit.effect.group for unit in added} == groups:
+            less = float((best.deviances() - model.deviances()).sum())
+            if less > _FORM * _explained(selection):
+                found += [unit.name for unit in added]
+    return found
+
+
+def _explained(selection: Selection) -> float:
+    """Return the deviance that the best model explains."""
+    return float((selection.nominal.deviances() - selection.best.deviances()).sum())
+
+
 def _alike(one: Effect, other: Effect) -> bool:
     """Return whether two effects act alike: of one group, or a servo's dead band and friction.
 
@@ -58,26 +82,26 @@ def _alike(one: Effect, other: Effect) -> bool:
     return len(groups) == 1 or (servo and "friction" in groups)
 
 
-def rivals(selection: Selection, name: str) -> list[Model]:
+def rivals(selection: Selection, name: str, *, form: float = _LAST) -> list[Model]:
     """Return the models with another effect in the place of one that are as good as the best.
 
-    Or nearly: effects of one group may be one cause that has neither's form, and no law is known
-    to the last percent of what it explains.
+    Or nearly: effects of one group may be one cause that has neither's form, so that all but the
+    share ``form`` of what is explained is enough.
     """
     return [
         m
         for m in selection.alternatives.get(name, ())
-        if as_good(selection.best, m) or _another_form(selection, m, name)
+        if as_good(selection.best, m) or _another_form(selection, m, name, form=form)
     ]
 
 
-def _another_form(selection: Selection, rival: Model, name: str) -> bool:
-    """Return whether a rival of the same group explains all but a percent of the same."""
+def _another_form(selection: Selection, rival: Model, name: str, *, form: float) -> bool:
+    """Return whether a rival of the same group explains nearly all of the same."""
     best = selection.best
     mine = {u.effect.group for u in best.units if u.name == name}
     others = {u.effect.group for u in rival.units if u not in best.units}
-    none, left, more = (float(m.deviances().sum()) for m in (selection.nominal, best, rival))
-    return mine == others and more - left < _FORM * (none - left)
+    more = float((rival.deviances() - best.deviances()).sum())
+    return mine == others and more < form * _explained(selection)
 
 
 def stand_in(selection: Selection, rival: Model) -> str:

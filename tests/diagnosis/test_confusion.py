@@ -1,0 +1,53 @@
+"""Which effects count as not told apart, on models with known misfits."""
+
+import numpy as np
+
+from torchrl_bayessim.diagnosis.confusion import confusion_set, rivals
+from torchrl_bayessim.diagnosis.model import Model
+from torchrl_bayessim.diagnosis.objective import Point, Unit
+from torchrl_bayessim.diagnosis.refit import Fit
+from torchrl_bayessim.diagnosis.selection import Selection
+from torchrl_bayessim.effects.catalogue import effect
+
+SEGMENTS, SIZE = 20, 10
+
+
+def model(square, *names):
+    """Return a model whose squared innovations are ``square`` on average."""
+    units = tuple(Unit(effect(name), "hinge", (1.0,), 0.0, 1.0) for name in names)
+    noise = np.random.default_rng(0).standard_normal((2 * SEGMENTS, SIZE))
+    left = noise * np.sqrt(square / (noise**2).mean(-1, keepdims=True))
+    fit = Fit(
+        Point(np.zeros(1), dict.fromkeys(units, 0.5)),
+        units,
+        left[:SEGMENTS],
+        np.zeros((SEGMENTS * SIZE, 1 + len(units))),
+    )
+    return Model(fit, left[SEGMENTS:], np.arange(2 * SEGMENTS))
+
+
+def selection(best, *tried):
+    nominal = model(11.0)
+    name = best.units[0].name
+    others = tuple(m for m in tried if len(m.units) == 1)
+    return Selection(nominal, best, (), (), (nominal, best, *tried), {name: others})
+
+
+def test_what_is_clearly_worse_is_told_apart():
+    found = selection(model(1.0, "action_delay"), model(3.0, "action_lag"))
+    assert confusion_set(found, "action_delay") == ("action_delay",)
+
+
+def test_another_form_of_the_same_cause_is_not_told_apart():
+    best = model(1.0, "action_delay")
+    found = selection(best, model(1.8, "action_lag"), model(1.8, "dead_band"))
+    assert confusion_set(found, "action_delay") == ("action_delay", "action_lag")
+    assert rivals(found, "action_delay") == []  # as good as the best it is not
+
+
+def test_what_acts_alike_and_explains_much_of_the_rest_is_not_told_apart():
+    best = model(5.0, "coulomb_friction")
+    beside = model(3.0, "coulomb_friction", "stribeck_friction")
+    other = model(3.0, "coulomb_friction", "action_delay")
+    found = selection(best, beside, other)
+    assert confusion_set(found, "coulomb_friction") == ("coulomb_friction", "stribeck_friction")
