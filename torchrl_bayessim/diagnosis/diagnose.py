@@ -24,6 +24,7 @@ from ..physics.mujoco import MujocoPhysics
 from .chance import chances, detectable, of_chance
 from .evidence import assemble
 from .holds import bridged
+from .modes import MODES
 from .objective import Unit, pushes_of, units_of
 from .onsets import with_onsets
 from .preparation import Prepared, prepare
@@ -42,6 +43,7 @@ def diagnose(
     *,
     effects: Sequence[str | Effect] | None = None,
     findings: Sequence[SanityFinding] = (),
+    mode: str = "segments",
     horizon: int | None = None,
     seed: int = 0,
     progress: Callable[[str], None] = lambda _: None,
@@ -55,15 +57,19 @@ def diagnose(
         logs: What the real robot did.
         effects: Names from the catalogue, or effects of your own; default the system's, or all.
         findings: Of the sanity gate, to be repeated in the report.
+        mode: What is predicted and compared: ``segments`` from measured states; ``trajectories``
+            from their first row on, where states cannot be set or hidden ones live long.
         horizon: Control steps that are predicted at a time; default chosen from the data.
         seed: Of the bootstrap and of the null distribution's draws.
         progress: Told what is done.
 
     Raises:
-        ValueError: There are no logs, or none is long enough.
+        ValueError: There are no logs, none is long enough, or there is no such mode.
         KeyError: An effect is not in the catalogue.
     """
     begun = time.perf_counter()
+    if mode not in MODES:
+        raise ValueError(message("a mode of the diagnosis", mode, available=list(MODES)))
     system = _system(simulator, prior)
     chosen = _effects(system, effects, logs)
     every = units_of(chosen, system.robot)
@@ -73,7 +79,9 @@ def diagnose(
     with threadpool_limits(1, user_api="blas"):
         progress("fitting the parameters")
         bridges, holds = bridged(logs, system.robot) if _asks_for_holds(every) else (logs, [])
-        prepared = prepare(system, bridges, units, generator=generator, horizon=horizon)
+        prepared = prepare(
+            system, bridges, units, generator=generator, mode=MODES[mode](), horizon=horizon
+        )
         units = _with_shapes(system, prepared, units)
         units = with_onsets(prepared.sets["train"], prepared.nominal.point, units)
         selection = select(

@@ -140,6 +140,7 @@ def assemble(
         ),
         audit={
             **{name: list(names) for name, names in prepared.names.items()},
+            "mode": prepared.mode.name,
             "simulator_steps": prepared.predictor.steps,
             "noise_floor_source": prepared.noise_source,
             "noise": dict(zip(system.robot.channels, prepared.noise.tolist(), strict=True)),

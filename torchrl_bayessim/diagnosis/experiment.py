@@ -31,9 +31,8 @@ from .excitations import excitations
 from .objective import Objective, Point, Unit, strengths_of
 from .preparation import Prepared
 from .refit import Fit, refit
-from .segments import cut, cut_for_fits
+from .segments import cut
 from .selection import Selection
-from .whitening import whitening
 
 Array = NDArray[np.float64]
 _SECONDS, _STEPS = 10.0, 200  # of one run, at most
@@ -195,9 +194,9 @@ def _observed(prepared: Prepared, log: Log, point: Point) -> Objective | None:
     history = train.segments.history
     if len(log) <= prepared.horizon + history:
         return None
-    pieces = cut_for_fits([log], prepared.horizon, history=history, most=_STEPS)
-    white = whitening(predictor, pieces, train.theta(point.z), prepared.noise)
-    return Objective(predictor, train.prior, pieces, white)
+    mode = prepared.mode
+    pieces = mode.cut([log], prepared.horizon, history=history, most=_STEPS)
+    return mode.objective(predictor, train.prior, pieces, z=point.z, noise=prepared.noise)
 
 
 def _discrimination(there: Fit, before: Fit, seen: Array) -> float:

@@ -24,8 +24,10 @@ __all__ = [
     "units_of",
 ]
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -153,9 +155,24 @@ class Objective:
 
     def take(self, index: NDArray[np.int64]) -> Objective:
         """Return the objective on some segments."""
-        return Objective(
-            self.predictor, self.prior, self.segments.take(index), self.whitening.take(index)
-        )
+        return self._but(segments=self.segments.take(index), whitening=self.whitening.take(index))
+
+    def along(self, segments: Segments) -> Objective:
+        """Return the same on other segments, as many, with the same covariance."""
+        return self._but(segments=segments)
+
+    def on(self, predictor: Predictor) -> Objective:
+        """Return the same with another simulator."""
+        return self._but(predictor=predictor)
+
+    def weighted(self, point: Point) -> Objective:
+        """Return the same with the robust weights that the segments deserve at a point."""
+        return self._but(whitening=self.whitening.weighted(self([point])[0]))
+
+    def _but(self, **changes: Any) -> Objective:
+        other = copy.copy(self)
+        other.__dict__.update(changes)
+        return other
 
     def theta(self, z: Array) -> Array:
         """Return parameters in their own units, shape ``(*, D)``."""

@@ -19,14 +19,13 @@ from ..errors import message
 from ..logs.log import Log
 from ..logs.system import System
 from .hidden import hidden_joints
-from .horizon import chosen_horizon
+from .modes import Mode, shortest
 from .noise import assumed_noise, measured_noise
 from .objective import Objective, Point, Unit, origin, parameters_at
 from .prediction import Predictor
 from .refit import Fit, refit
 from .segments import Segments, cut, cut_for_fits
 from .time_steps import with_fewest_steps
-from .whitening import Whitening, whitening
 
 Array = NDArray[np.float64]
 _HISTORY = 0.4  # seconds of commands that delay lines and filters look back at
@@ -54,6 +53,7 @@ class Prepared:
         horizon: Control steps per segment.
         nominal: The fit of the parameters alone.
         alarms: What the reader must know.
+        mode: What is predicted and compared.
     """
 
     predictor: Predictor
@@ -64,6 +64,7 @@ class Prepared:
     horizon: int
     nominal: Fit
     alarms: tuple[str, ...]
+    mode: Mode
 
     @property
     def names(self) -> dict[str, tuple[str, ...]]:
@@ -117,6 +118,7 @@ def prepare(
     units: Sequence[Unit],
     *,
     generator: np.random.Generator,
+    mode: Mode,
     horizon: int | None = None,
 ) -> Prepared:
     """Split the logs, estimate the noise, choose the horizon, and fit the parameters.
@@ -126,6 +128,7 @@ def prepare(
         logs: Its logs.
         units: The effects that will be looked for; the horizon is chosen so that they show.
         generator: Of simulated noise, on which the whitening is checked.
+        mode: What is predicted and compared.
         horizon: Control steps per segment; default chosen.
 
     Raises:
@@ -137,10 +140,10 @@ def prepare(
     predictor = Predictor(system)
     alarms: list[str] = []
     parts = split(logs)
-    shortest = min(max(len(log) for log in part) for part in parts.values())
-    if shortest <= max(_FEWEST, horizon or 0):
+    rows = shortest(parts)
+    if rows <= max(_FEWEST, horizon or 0):
         expected = f"runs of more than {max(_FEWEST, horizon or 0)} rows in every split"
-        raise ValueError(message(expected, f"{shortest} rows", hint="record longer"))
+        raise ValueError(message(expected, f"{rows} rows", hint="record longer"))
     if len(logs) < 3:
         alarms.append(
             f"{len(logs)} trajectories: training, validation and test are stretches of the same "
@@ -148,24 +151,20 @@ def prepare(
         )
     history = min(max(8, round(_HISTORY / system.control_dt)), 100)
     parts = _completed(predictor, system, parts, history=history, alarms=alarms)
-    some = cut(parts["train"], min(_STEPS, shortest // 2), history=history, most=_FEW)
+    some = cut(parts["train"], min(_STEPS, rows // 2), history=history, most=_FEW)
     noise = assumed_noise(system, predictor, parts["train"])
     predictor = with_fewest_steps(predictor, some, units, z=origin(system.prior), noise=noise)
     noise, source = measured_noise(
         system, predictor, parts["train"], history=history, alarms=alarms
     )
     if horizon is None:
-        horizon = chosen_horizon(
-            predictor, system, parts["train"], units=units, noise=noise, history=history
-        )
-        horizon = min(horizon, shortest // 2)
+        horizon = mode.horizon(predictor, parts, units=units, noise=noise, history=history)
     pieces = {
-        name: cut_for_fits(part, horizon, history=history, most=max(12, _ROWS[name] // horizon))
+        name: mode.cut(part, horizon, history=history, most=max(12, _ROWS[name] // horizon))
         for name, part in parts.items()
     }
-    nominal, whitenings = _nominal(predictor, system, pieces, noise=noise, generator=generator)
-    sets = {n: Objective(predictor, system.prior, pieces[n], whitenings[n]) for n in pieces}
-    return Prepared(predictor, sets, parts, noise, source, horizon, nominal, tuple(alarms))
+    nominal, sets = _nominal(predictor, pieces, mode, noise=noise, generator=generator)
+    return Prepared(predictor, sets, parts, noise, source, horizon, nominal, tuple(alarms), mode)
 
 
 def _completed(
@@ -182,7 +181,7 @@ def _completed(
     """
     noise = assumed_noise(system, predictor, parts["train"])
     theta = parameters_at(system.prior, origin(system.prior))
-    steps = min(_STEPS, min(max(len(log) for log in part) for part in parts.values()) // 2)
+    steps = min(_STEPS, shortest(parts) // 2)
     some = cut(parts["train"], steps, history=history, most=_FEW)
     hidden = hidden_joints(predictor, some, theta, noise)
     if not hidden:
@@ -192,9 +191,9 @@ def _completed(
     for _ in range(_ROUNDS if system.prior is not None else 1):
         train = hidden.estimated(predictor, parts["train"], theta=theta, noise=noise)
         pieces = cut_for_fits(train, steps, history=history, most=_MANY)
-        fit, whitenings = _nominal(predictor, system, {"train": pieces}, noise=noise)
+        fit, sets = _nominal(predictor, {"train": pieces}, Mode(), noise=noise)
         theta = parameters_at(system.prior, fit.point.z)
-        curvature = whitenings["train"].curvature
+        curvature = sets["train"].whitening.curvature
     hidden.require_sure(curvature)
     found = {
         name: hidden.estimated(predictor, logs, theta=theta, noise=noise)
@@ -206,26 +205,22 @@ def _completed(
 
 def _nominal(
     predictor: Predictor,
-    system: System,
     pieces: Mapping[str, Segments],
+    mode: Mode,
     *,
     noise: Array,
     generator: np.random.Generator | None = None,
-) -> tuple[Fit, dict[str, Whitening]]:
-    """Fit the parameters, with the whitening and the robust weights that belong to the fit."""
-    z = origin(system.prior)
+) -> tuple[Fit, dict[str, Objective]]:
+    """Fit the parameters, with the covariance and the robust weights that belong to the fit."""
+    prior = predictor.system.prior
+    z = origin(prior)
     every = max(1, len(pieces["train"]) // _FEW)
     some = pieces["train"].take(np.arange(0, len(pieces["train"]), every))
     for _ in range(2):
-        white = whitening(predictor, some, parameters_at(system.prior, z), noise)
-        objective = Objective(predictor, system.prior, some, white)
+        objective = mode.objective(predictor, prior, some, z=z, noise=noise)
         z = refit(objective, [Point(z)])[0].point.z
-    whitenings = {}
+    sets = {}
     for name, part in pieces.items():
-        bare = whitening(
-            predictor, part, parameters_at(system.prior, z), noise, generator=generator
-        )
-        innovations = Objective(predictor, system.prior, part, bare)([Point(z)])[0]
-        whitenings[name] = bare.weighted(innovations)
-    objective = Objective(predictor, system.prior, pieces["train"], whitenings["train"])
-    return refit(objective, [Point(z)])[0], whitenings
+        bare = mode.objective(predictor, prior, part, z=z, noise=noise, generator=generator)
+        sets[name] = bare.weighted(Point(z))
+    return refit(sets["train"], [Point(z)])[0], sets

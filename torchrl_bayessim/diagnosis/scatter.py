@@ -17,10 +17,9 @@ from ..effects.units import unit_at
 from ..logs.log import Log
 from .chance import Chance
 from .holds import Hold
-from .objective import Objective, Point, Unit, strengths_of
+from .objective import Point, Unit, strengths_of
 from .preparation import Prepared, split
 from .report import Candidate, Finding
-from .segments import cut_for_fits
 from .selection import Selection
 from .shrinkage import Shrinkage
 
@@ -33,13 +32,12 @@ def gap_with_holds(prepared: Prepared, logs: Sequence[Log], selection: Selection
     if test.segments.uncertainty is not None:  # the held samples entered the estimates too
         return 1.0
     size = len(test.segments)
-    pieces = cut_for_fits(
+    pieces = prepared.mode.cut(
         split(logs)["test"], prepared.horizon, history=test.segments.history, most=size
     )
     if len(pieces) != size:
         return 1.0
-    recorded = Objective(test.predictor, test.prior, pieces, test.whitening)
-    left = recorded([selection.nominal.fit.point])[0]
+    left = test.along(pieces)([selection.nominal.fit.point])[0]
     return float((left**2).sum() / (test.whitening.weights**2).sum() / left.shape[1])
 
 

@@ -147,7 +147,7 @@ def _exactly(train: Objective, validation: Objective, model: Model) -> Model:
         return model
     exact = train.predictor.divided(train.predictor.system.task.frame_skip)
     exact.exactly()
-    there = Objective(exact, train.prior, train.segments, train.whitening)([model.fit.point])[0]
+    there = train.on(exact)([model.fit.point])[0]
     if float(((there - model.fit.innovations) ** 2).sum()) < _UNSEEN:
         return model
     for predictor in {train.predictor, validation.predictor}:

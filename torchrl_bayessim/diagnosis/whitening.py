@@ -31,6 +31,7 @@ from .segments import Segments
 Array = NDArray[np.float64]
 _WORST = 1e3  # innovations beyond this, and those of diverged simulations, count as this
 _KNOWN = 3.0  # times the error of an estimate that knows what it is to predict
+_ROUNDING = 1e-13  # of the largest variance
 _DRAWS = 8  # simulated robots that the whitening is checked on
 _THIRD_DIFFERENCE = 20.0  # 1 + 9 + 9 + 1: variance of y₃ - 3y₂ + 3y₁ - y₀ per unit of white noise
 
@@ -108,9 +109,10 @@ def whitening(
     spread = np.einsum("jsm,jsn->smn", slope, slope) + np.einsum("jsm,jsn->smn", curve, curve)
     step = 2.0 * (nominal - np.nan_to_num(finer.reshape(size, -1)))
     spread += 0.25 * step[:, :, None] * step[:, None, :]
-    spread[:, np.arange(checks * channels), np.arange(checks * channels)] += np.tile(
-        noise**2, checks
-    )
+    every = np.arange(checks * channels)
+    # where chaos amplifies the start's noise a millionfold, rounding errors are not negligible
+    rounding = _ROUNDING * spread[:, every, every].max(1, keepdims=True)
+    spread[:, every, every] += np.tile(noise**2, checks) + rounding
     lower = np.linalg.cholesky(spread)
     inverse = np.linalg.inv(lower)
     if generator is not None:
