@@ -8,7 +8,8 @@ it into the simulator. Then twice the same, with the simulator as it was and wit
 strength is one more dimension of the posterior: infer from the logs, train PPO under the posterior,
 and score it at the robot. Each seed has logs, networks and policies of its own; both policies
 have as many frames. If a diagnosis names nothing, the recipe says so and stops. Writes result.json,
-table.md and close_the_loop.png.
+table.md and close_the_loop.png; ``resume=FOLDER`` goes on after a break, with the policies that are
+done.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +64,7 @@ class CloseTheLoop(recipe.Settings):
     environments: int = 120  # in multiples of the six logs, whose actions they replay
     episodes: int = 100  # at the robot, for the score
     short: bool = False  # a smoke test: everything runs, little is learned
+    resume: str = ""  # folder of a run that was broken off
 
 
 def job(settings: CloseTheLoop, out: Path) -> dict[str, Any]:
@@ -88,7 +91,8 @@ def job(settings: CloseTheLoop, out: Path) -> dict[str, Any]:
     runs = []
     for seed in tqdm(seeds, desc="seeds", disable=not settings.progress):
         for source in SOURCES:
-            runs.append(trained(source, reports[seed], logs[seed], settings=settings, seed=seed))
+            part = partial(trained, source, reports[seed], logs[seed], settings=settings, seed=seed)
+            runs.append(recipe.kept(out / "parts" / f"{source}_{seed}.json", part))
             print(sentence(runs[-1]))
     result = told | revealed() | summarised(runs)
     write_text(out / "table.md", table(result))

@@ -14,7 +14,6 @@ are kept in ``out``, so that the same command goes on after a break.
 
 from __future__ import annotations
 
-import json
 import math
 import statistics
 import time
@@ -82,7 +81,6 @@ def job(settings: Recovery, out: Path) -> dict[str, Any]:
     seeds = range(settings.seed, settings.seed + settings.seeds)
     todo = [(name, seed) for seed in seeds for name in names]
     folder = out / "parts"
-    folder.mkdir(exist_ok=True)
     with workers(settings.processes, threads=settings.threads) as pool:
         jobs = [pool.submit(run, settings, name, seed, folder) for name, seed in todo]
         parts = []
@@ -163,9 +161,12 @@ class Laboratory:
 def run(settings: Recovery, name: str, seed: int, folder: Path) -> dict[str, Any]:
     """Return what every method says about one problem with one seed; kept in a file."""
     protocol = "paper" if settings.paper_mode else "own"
-    kept = folder / f"{name}_{protocol}_{settings.simulations}_{settings.truths}_{seed}.json"
-    if kept.exists():
-        return json.loads(kept.read_text())
+    file = folder / f"{name}_{protocol}_{settings.simulations}_{settings.truths}_{seed}.json"
+    return recipe.kept(file, lambda: answered(settings, name, seed))
+
+
+def answered(settings: Recovery, name: str, seed: int) -> dict[str, Any]:
+    """Return the same, from simulations and fits."""
     start = time.perf_counter()
     problem = PROBLEMS[name]
     prior = problem.prior
@@ -199,7 +200,7 @@ def run(settings: Recovery, name: str, seed: int, folder: Path) -> dict[str, Any
             few.close()
     lab.close()
     q = pictured["posterior"]
-    result = {
+    return {
         "problem": name,
         "seed": seed,
         "methods": found,
@@ -209,8 +210,6 @@ def run(settings: Recovery, name: str, seed: int, folder: Path) -> dict[str, Any
         "draws": draw(q, 2000, key=(seed, "picture")).tolist(),
         "seconds": time.perf_counter() - start,
     }
-    write_text(kept, json.dumps(recipe.plain(result)))
-    return result
 
 
 def kinds(lab: Laboratory, x: Tensor) -> dict[str, slice]:

@@ -222,6 +222,13 @@ def save_picture(figure: Figure, path: Path, *, dpi: int = 150) -> None:
         figure.savefig(file, format="png", dpi=dpi)
 
 
+def kept(path: Path, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return what a part of a run gave: from its file, or from ``work()``, which is then kept."""
+    if not path.exists():
+        write_text(path, json.dumps(plain(work())))
+    return json.loads(path.read_text())
+
+
 def plain(value: Any) -> Any:
     """Return what JSON can hold."""
     if isinstance(value, dict):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ from torchrl_bayessim.simulate import simulate
 from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.summaries import SummaryStatistics
 from torchrl_bayessim.transforms import DomainRandomizer
-from torchrl_bayessim.whole_file import write_text
 
 # Mean return of the episodes that end in a fortieth of the training (Gymnasium's own mark for
 # CartPole), or success in 64 episodes
@@ -50,9 +48,12 @@ class Study:
 
     def scored(self, source: str) -> dict[str, Any]:
         """Return the scores of the policy trained under ``source``, from its file if it has one."""
-        file = self.out / f"{source}.json"
-        if file.exists():
-            return json.loads(file.read_text())
+        found = recipe.kept(self.out / f"{source}.json", lambda: self._scored(source))
+        replayed = self.out / f"{source}.pt"  # a hundred megabytes
+        replayed.unlink(missing_ok=True)
+        return found
+
+    def _scored(self, source: str) -> dict[str, Any]:
         learner = self._learner()
         trained = self._trained(source, learner)
         learner.policy.load_state_dict(trained.best)
@@ -62,9 +63,7 @@ class Study:
         found["solved"] = first_solved(shown, SOLVED[self.settings.task])
         names = ("frames", "return", "score", "seconds", "cpu_seconds")
         found["curve"] = [{name: p[name] for name in names if name in p} for p in shown]
-        write_text(file, json.dumps(recipe.plain(found)))
-        (self.out / f"{source}.pt").unlink()  # with the replay buffer, a hundred megabytes
-        return recipe.plain(found)
+        return found
 
     def _learner(self) -> Any:
         if isinstance(self.task, GoalTask):

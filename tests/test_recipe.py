@@ -213,3 +213,18 @@ def test_a_run_resumes_with_its_own_settings_only(setting, said, finished, refus
     folder, _ = finished
     assert said in refused(f"resume={folder}", setting)
     assert not Path("elsewhere").exists()
+
+
+def test_a_part_that_is_kept_is_not_done_again(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(RECIPE.parent)
+    from recipe import kept
+
+    done = []
+
+    def work():
+        done.append("once")
+        return {"mean": float("nan"), "seeds": (1, 2)}
+
+    first, again = (kept(tmp_path / "parts" / "seed1.json", work) for _ in range(2))
+    assert first == again == {"mean": None, "seeds": [1, 2]}
+    assert done == ["once"]
