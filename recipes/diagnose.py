@@ -101,11 +101,7 @@ def chosen(effects: str) -> list[str] | None:
     """Return the names of the effects to consider, ``None`` for the system's own."""
     if not effects:
         return None
-    names = [name.strip() for name in effects.split(",")]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(message("each effect once", twice))
-    return names
+    return [name.strip() for name in effects.split(",")]
 
 
 @contextmanager

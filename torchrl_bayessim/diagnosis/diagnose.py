@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ..effects.catalogue import CATALOGUE, effect
+from ..effects.catalogue import CATALOGUE, each_once, effect
 from ..effects.effect import Effect
 from ..effects.sensors import SensorDropout
 from ..envs.task import Task
@@ -64,7 +64,8 @@ def diagnose(
         progress: Told what is done.
 
     Raises:
-        ValueError: There are no logs, none is long enough, or there is no such mode.
+        ValueError: There are no logs, none is long enough, an effect is asked for twice, or there
+            is no such mode.
         KeyError: An effect is not in the catalogue.
     """
     begun = time.perf_counter()
@@ -154,6 +155,7 @@ def _effects(
 ) -> list[Effect]:
     if effects is None:
         effects = list(CATALOGUE) if system.effects is None else system.effects
+    each_once(effects)
     seconds = max((len(log) for log in logs), default=1) * system.control_dt
     forms = [effect(e).forms(seconds) if isinstance(e, str) else (e,) for e in effects]
     return [form for some in forms for form in some]

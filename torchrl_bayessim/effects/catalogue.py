@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-__all__ = ["CATALOGUE", "effect"]
+__all__ = ["CATALOGUE", "each_once", "effect"]
 
+from collections.abc import Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -77,3 +78,14 @@ def effect(name: str, **options: Any) -> Effect:
     if name not in CATALOGUE:
         raise KeyError(message("an effect of the catalogue", name, available=CATALOGUE))
     return CATALOGUE[name](**options)
+
+
+def each_once(effects: Sequence[str | Effect]) -> None:
+    """Check that no effect is asked for twice.
+
+    Raises:
+        ValueError: One is.
+    """
+    twice = next((one for one in effects if effects.count(one) > 1), None)
+    if twice is not None:
+        raise ValueError(message("each effect once", twice))

@@ -32,6 +32,7 @@ from pathlib import Path
 
 import torch
 
+from ..effects.catalogue import each_once
 from ..effects.robot import Robot, robot_of
 from ..envs.task import Task
 from ..errors import message
@@ -100,10 +101,7 @@ class System:
                 raise ValueError(message("a channel in noise", name, available=known))
             if not 0 <= value < math.inf:
                 raise ValueError(message(f"a standard deviation of {name}, 0 or more", value))
-        effects = self.effects or ()
-        if len(set(effects)) < len(effects):
-            twice = next(name for name in effects if effects.count(name) > 1)
-            raise ValueError(message("each effect once", twice))
+        each_once(self.effects or ())
 
     @classmethod
     def load(cls, path: str | Path) -> System:
