@@ -13,6 +13,7 @@ Tiers: T0 no cause; T1 a cause as the catalogue has it; T2 the same cause in ano
 whose class is withheld from the catalogue; T4 a cause that no catalogue has; T5 two causes; T6 the
 robot in another engine (MuJoCo with another integrator, cone and solver); controls: parameters at
 the edge of the prior, twice the noise of the data sheet, actions shuffled between trajectories.
+``baselines=true`` asks other methods too (see ``baselines/methods.py``), on the same folders.
 Causes below ``threshold`` (see ``withheld/detectability.py``) cannot be seen by anyone, and are
 left out of the scores of T1 to T6; ``by_detectability`` has them.
 """
@@ -28,9 +29,11 @@ from typing import Any
 
 import numpy as np
 import recipe
+from baselines import methods
 from tqdm import tqdm
 from withheld import cases, folders, page, plans, scoring
-from withheld.shrinkage import true_shrinkage
+from withheld.comparison import compared
+from withheld.shrinkage import gaps_removed, true_shrinkage
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.errors import message
@@ -38,6 +41,7 @@ from torchrl_bayessim.logs.read import read_logs
 from torchrl_bayessim.logs.system import System
 from torchrl_bayessim.whole_file import replacing, write_text
 
+DIAGNOSIS = "diagnosis"
 TIERS = ("T0", "T1", "T2", "T3", "T4", "T5", "T6", "controls")
 # Robots, and cases by tier and robot. What the issue of a release asks for takes longer than two
 # hours: robots=arm,two_links tiers=T0=150,T1=250,T2=250,T3=130,T4=40,T5=30,T6=20,controls=10
@@ -55,6 +59,7 @@ class Withheld(recipe.Settings):
     robots: str = ""  # such as arm,two_links; default of short or full
     tiers: str = ""  # such as T0=4,T2=10: cases by tier and robot; default of short or full
     threshold: float = 100.0  # detectability from which a cause counts as visible
+    baselines: bool = False  # whether other methods answer too: about three times the time
     short: bool = False
     resume: str = ""
 
@@ -76,17 +81,19 @@ def job(settings: Withheld, out: Path) -> dict[str, Any]:
     for name in _progress(names, settings, "diagnosing"):
         if not (out / "reports" / f"{name}.json").exists():
             examine(out / "cases" / name, out / "reports" / f"{name}.json", seed=settings.seed)
+    if settings.baselines:
+        for name in _progress(names, settings, "asking baselines"):
+            ask_baselines(out, name, seed=settings.seed)
     if folders.digest(sealed) != seal:
         raise ValueError(message("labels as they were sealed", "another file"))
     labels = json.loads(sealed.read_text())
-    reports = {n: json.loads((out / "reports" / f"{n}.json").read_text()) for n in names}
-    records = [
-        scoring.record(labels[name], reports[name], realised(out, name, reports[name]))
-        | {"case": name}
-        for name in names
-    ]
+    everyone = scored(settings, out, labels)
+    records = everyone[DIAGNOSIS]
     write_text(out / "records.json", json.dumps(recipe.plain(records), indent=1))
     result = scoring.scores(records, threshold=settings.threshold) | {"labels_sha256": seal}
+    if settings.baselines:
+        write_text(out / "baselines.json", json.dumps(recipe.plain(everyone), indent=1))
+        result["methods"] = compared(everyone, threshold=settings.threshold)
     page.write_page(records, result, out)
     return result
 
@@ -138,10 +145,42 @@ def examine(case: Path, report: Path, *, seed: int) -> None:
     write_text(report, json.dumps(scoring.finite(found)))
 
 
+def ask_baselines(out: Path, name: str, *, seed: int) -> None:
+    """Write what the baselines say of a folder, with the budget that the diagnosis took."""
+    file = out / "baselines" / f"{name}.json"
+    if file.exists():
+        return
+    report = json.loads((out / "reports" / f"{name}.json").read_text())
+    budget = report.get("audit", {}).get("simulator_steps", 0)
+    file.parent.mkdir(exist_ok=True)
+    said = methods.answers(out / "cases" / name, budget=budget, seed=seed)
+    write_text(file, json.dumps(scoring.finite(said)))
+
+
+def scored(
+    settings: Withheld, out: Path, labels: Mapping[str, Any]
+) -> dict[str, list[dict[str, Any]]]:
+    """Return the records of all cases, of the diagnosis and of the baselines if they were asked."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for name in sorted(labels):
+        reports = {DIAGNOSIS: json.loads((out / "reports" / f"{name}.json").read_text())}
+        removed: Mapping[str, float | None] = {}
+        if settings.baselines:
+            reports |= json.loads((out / "baselines" / f"{name}.json").read_text())
+            system = System.load(out / "cases" / name / "system.yaml")
+            logs = read_logs(out / "cases" / name, system)
+            removed = gaps_removed(system, logs, out / "sealed" / name / "unseen.npz", reports)
+        for method, report in reports.items():
+            shrinks = realised(out, name, report)
+            one = scoring.record(labels[name], report, shrinks) | {"case": name}
+            found.setdefault(method, []).append(one | {"removed": removed.get(method)})
+    return found
+
+
 def realised(out: Path, name: str, report: Mapping[str, Any]) -> float | None:
     """Return how far the gap truly shrinks, in motions that the diagnosis never saw."""
     case = out / "cases" / name
-    if not report.get("effects"):
+    if not report.get("effects") or report["verdict"] not in scoring.NAMING:
         return None
     system = System.load(case / "system.yaml")
     logs = read_logs(case, system)

@@ -14,6 +14,7 @@ import recipe
 from torchrl_bayessim.whole_file import write_text
 
 from .classes import CLASSES
+from .comparison import comparison_table
 
 Record = dict[str, Any]
 
@@ -24,6 +25,7 @@ def write_page(records: Sequence[Record], result: Mapping[str, Any], out: Path) 
         "# Blind check of the gap diagnosis",
         f"Labels sealed before the first diagnosis: `{result['labels_sha256']}`. Causes count as "
         f"visible from a detectability of {result['threshold']:g}; intervals are Wilson's, 95 %.",
+        *_against(result),
         table(result),
         "By detectability (T1 and T2, class):",
         _lines({k: {"top1_class": v} for k, v in result["by_detectability"].items()}),
@@ -35,6 +37,14 @@ def write_page(records: Sequence[Record], result: Mapping[str, Any], out: Path) 
     write_text(out / "page.md", "\n\n".join(parts) + "\n")
     _confusion(records, result["threshold"], out / "confusion.png")
     _calibration(records, out / "calibration.png")
+
+
+def _against(result: Mapping[str, Any]) -> list[str]:
+    """Return the comparison with the baselines, where they were asked for."""
+    if "methods" not in result:
+        return []
+    lead = "Against baselines on the same folders, scored by the same code, all robots together:"
+    return ["## Baselines", lead, comparison_table(result["methods"]), "## All scores"]
 
 
 def table(result: Mapping[str, Any]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["finite", "record", "scores", "share", "wilson"]
+__all__ = ["NAMING", "Record", "finite", "record", "scores", "share", "wilson"]
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -13,7 +13,7 @@ from .classes import class_of
 
 Record = dict[str, Any]
 _Z = 1.959963984540054
-_NAMING = {"named", "named_partial", "ambiguous"}
+NAMING = {"named", "named_partial", "ambiguous"}
 _CHANNELS = {"actuation", "body", "contact", "sensing"}
 
 
@@ -56,7 +56,7 @@ def record(
     """
     truths = label["truths"]
     # a verdict that explains nothing names nothing, whatever was tried
-    effects = report.get("effects", []) if report["verdict"] in _NAMING else []
+    effects = report.get("effects", []) if report["verdict"] in NAMING else []
     named = [effect["name"] for effect in effects]
     confused = report.get("confusion_set", [])
     true = [truth["name"] for truth in truths]
@@ -69,7 +69,7 @@ def record(
         "confusion_set": confused, "seconds": report["seconds"],
         "p_value": min((c["p_value"] for c in report.get("candidates", ())), default=None),
     }  # fmt: skip
-    if shrinks is not None and report["verdict"] in _NAMING:
+    if shrinks is not None and report["verdict"] in NAMING:
         gap = report["gap"]
         one["shrinkage"] = {
             "true": shrinks, "predicted": gap["explained_fraction"], "ci95": gap["ci95"]

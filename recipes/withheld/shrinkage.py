@@ -3,11 +3,14 @@
 ``1 - E_effects / E_refit``, where ``E`` is the mean squared innovation of the fitted simulator
 without and with the effects that were named. There is no noise, so there is no floor. This runs
 after the labels are opened, and uses the package: the fitted simulator is the package's.
+
+Methods are compared by ``1 - E_method / E_prior``: what parameters and effects remove together of
+the error at the prior's mean.
 """
 
 from __future__ import annotations
 
-__all__ = ["true_shrinkage"]
+__all__ = ["gaps_removed", "true_shrinkage"]
 
 import math
 from collections.abc import Mapping, Sequence
@@ -18,13 +21,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchrl_bayessim.diagnosis.objective import Point, strengths_of, units_of
+from torchrl_bayessim.diagnosis.objective import (
+    Point,
+    Unit,
+    parameters_at,
+    strengths_of,
+    units_of,
+)
 from torchrl_bayessim.diagnosis.prediction import Predictor
 from torchrl_bayessim.diagnosis.segments import cut
 from torchrl_bayessim.diagnosis.whitening import whitening
 from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.system import System
+
+from .scoring import NAMING
 
 Array = NDArray[np.float64]
 _HISTORY = 0.4  # s of commands before a segment
@@ -43,28 +54,84 @@ def true_shrinkage(
     """
     if not report.get("effects"):
         return None
-    robot = system.robot
-    names = [found["name"] for found in report["effects"]]
-    units = {(u.name, u.where): u for u in units_of([effect(name) for name in names], robot)}
-    on = {
-        units[found["name"], where]: strength
+    theta = np.array([_theta(report, kind) for kind in ("without_effects", "with_effects")])
+    strengths = [{}, _named(system, report)]
+    horizon = report["gap"]["horizon_steps"]
+    noise = np.array([report["audit"]["noise"][name] for name in system.robot.channels])
+    seen = _logs(unseen, logs[0], system)
+    refit, after = _errors(system, seen, theta, strengths, horizon=horizon, noise=noise)
+    return float(1 - after / refit)
+
+
+def gaps_removed(
+    system: System, logs: Sequence[Log], unseen: Path, reports: Mapping[str, Mapping[str, Any]]
+) -> dict[str, float | None]:
+    """Return the share of the error at the prior's mean that every method removes, -1 at least.
+
+    Where a verdict names nothing, the parameters were fitted alone. The noise and the horizon, in
+    whose units errors count, are those of the first report.
+
+    Args:
+        system: The nominal system of the case.
+        logs: What the methods saw, for what was measured.
+        unseen: File with the motions.
+        reports: Of the methods; those without parameters have no share.
+    """
+    able = {name: r for name, r in reports.items() if "parameters" in r}
+    found: dict[str, float | None] = dict.fromkeys(reports)
+    if not able:
+        return found
+    first = next(iter(able.values()))
+    naming = {name: r["verdict"] in NAMING for name, r in able.items()}
+    kinds = {n: "with_effects" if named else "without_effects" for n, named in naming.items()}
+    size = 1 if system.prior is None else 1 + len(system.prior.names)
+    prior = parameters_at(system.prior, np.zeros(size))
+    errors = _errors(
+        system,
+        _logs(unseen, logs[0], system),
+        np.array([prior, *(_theta(r, kinds[name]) for name, r in able.items())]),
+        [{}, *(_named(system, r) if naming[name] else {} for name, r in able.items())],
+        horizon=first["gap"]["horizon_steps"],
+        noise=np.array([first["audit"]["noise"][name] for name in system.robot.channels]),
+    )
+    shares = np.maximum(1 - errors[1:] / errors[0], -1.0)
+    return found | dict(zip(able, shares.tolist(), strict=True))
+
+
+def _theta(report: Mapping[str, Any], kind: str) -> list[float]:
+    return [parameter[kind] for parameter in report["parameters"]]
+
+
+def _named(system: System, report: Mapping[str, Any]) -> dict[Unit, float]:
+    """Return the strengths that a report names, at single targets."""
+    names = dict.fromkeys(found["name"] for found in report["effects"])
+    units = units_of([effect(name) for name in names], system.robot)
+    by_place = {(unit.name, unit.where): unit for unit in units}
+    return {
+        by_place[found["name"], where]: strength
         for found in report["effects"]
         for where, strength in found["strengths"].items()
     }
+
+
+def _errors(
+    system: System,
+    seen: Sequence[Log],
+    theta: Array,
+    strengths: Sequence[Mapping[Unit, float]],
+    *,
+    horizon: int,
+    noise: Array,
+) -> Array:
+    """Return the mean squared innovation of simulators on noise-free logs, shape ``(P,)``."""
     place = np.zeros(1)
-    strengths = strengths_of([Point(place), Point(place, on)], robot)
-    theta = np.array(
-        [[p[kind] for p in report["parameters"]] for kind in ("without_effects", "with_effects")]
-    )
-    horizon = report["gap"]["horizon_steps"]
+    on = strengths_of([Point(place, some) for some in strengths], system.robot)
     history = math.ceil(_HISTORY / system.control_dt)
-    segments = cut(_logs(unseen, logs[0], system), horizon, history=history, burn_in=history)
+    segments = cut(seen, horizon, history=history, burn_in=history)
     predictor = Predictor(system, threads=1)
-    noise = np.array([report["audit"]["noise"][name] for name in robot.channels])
     white = whitening(predictor, segments, theta[0], noise)
-    errors = (white(predictor.residuals(segments, theta, strengths)) ** 2).reshape(2, -1)
-    refit, after = np.nan_to_num(errors, nan=1e6).mean(1)
-    return float(1 - after / refit)
+    errors = (white(predictor.residuals(segments, theta, on)) ** 2).reshape(len(theta), -1)
+    return np.nan_to_num(errors, nan=1e6).mean(1)
 
 
 def _logs(unseen: Path, like: Log, system: System) -> list[Log]:

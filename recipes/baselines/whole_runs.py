@@ -1,0 +1,100 @@
+"""What every baseline is given: the folder of a case, its runs simulated whole, and no label."""
+
+from __future__ import annotations
+
+__all__ = ["Runs", "mean_square", "whole_runs"]
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_bayessim.diagnosis.objective import Objective, Unit, units_of
+from torchrl_bayessim.diagnosis.prediction import Predictor
+from torchrl_bayessim.diagnosis.preparation import split
+from torchrl_bayessim.diagnosis.segments import Segments, cut
+from torchrl_bayessim.diagnosis.tangent import Tangent
+from torchrl_bayessim.diagnosis.time_steps import with_fewest_steps
+from torchrl_bayessim.diagnosis.whitening import Whitening, noise_from_differences
+from torchrl_bayessim.effects.catalogue import CATALOGUE, effect
+from torchrl_bayessim.logs.log import Log
+from torchrl_bayessim.logs.system import System
+
+Array = NDArray[np.float64]
+_CHECKS = 50  # compared rows of a run
+_HISTORY = 0.4  # s of commands that delays look back at
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """Runs that are simulated from their first row to their last, with the recorded commands.
+
+    Attributes:
+        system: The nominal system.
+        logs: Of each split, ``train``, ``validation`` and ``test``: those of the diagnosis.
+        noise: Standard deviation of each channel's noise, told or from differences.
+        sets: Objectives of each split; their innovations are residuals over ``noise``.
+        units: The effects that may be named, random ones left out.
+    """
+
+    system: System
+    logs: Mapping[str, Sequence[Log]]
+    noise: Array
+    sets: Mapping[str, Objective]
+    units: tuple[Unit, ...]
+
+    @property
+    def predictor(self) -> Predictor:
+        """Simulates."""
+        return self.sets["train"].predictor
+
+
+def whole_runs(system: System, logs: Sequence[Log]) -> Runs:
+    """Return the runs of a case, ready to be simulated under any parameters and effects."""
+    parts, noise = split(logs), _noise(system, logs)
+    steps = min(len(log) for log in logs) - 1
+    history = round(_HISTORY / system.control_dt)
+    runs = {n: cut(part, steps, history=history, checks=_CHECKS) for n, part in parts.items()}
+    names = list(CATALOGUE) if system.effects is None else system.effects
+    every = units_of([effect(name) for name in names], system.robot)
+    units = tuple(unit for unit in every if not unit.effect.random)
+    nominal = np.zeros(1 if system.prior is None else 1 + len(system.prior.names))
+    predictor = with_fewest_steps(
+        Predictor(system, threads=1), runs["train"], units, z=nominal, noise=noise
+    )
+    sets = {
+        name: Objective(predictor, system.prior, some, _divided_by(noise, some))
+        for name, some in runs.items()
+    }
+    return Runs(system, parts, noise, sets, units)
+
+
+def mean_square(innovations: Array) -> float:
+    """Return the mean squared residual in units of the noise: 1 for a perfect simulator."""
+    return float(np.mean(innovations**2))
+
+
+def _noise(system: System, logs: Sequence[Log]) -> Array:
+    tangent, channels = Tangent(system.task.model), list(system.channel_index)
+    values = []
+    for log in logs:
+        qpos = log.qpos.numpy()
+        both = [tangent.difference(qpos[:1], qpos), log.qvel.numpy()]
+        values.append(np.concatenate(both, -1)[:, channels])
+    guess = noise_from_differences(logs, values)
+    told = [system.noise.get(name, np.nan) for name in system.robot.channels]
+    return np.where(np.isnan(told), guess, told)
+
+
+def _divided_by(noise: Array, runs: Segments) -> Whitening:
+    """Return no whitening but a division: what whole-run fits in the literature do."""
+    count, size = len(runs), len(runs.checked) * len(noise)
+    scale = np.tile(noise, len(runs.checked))
+    return Whitening(
+        inverse=np.broadcast_to(np.diag(1 / scale), (count, size, size)),
+        weights=np.ones(count),
+        spread=np.broadcast_to(noise, (count, len(runs.checked), len(noise))),
+        drift=np.zeros((count, size)),
+        curvature=0.0,
+    )
