@@ -32,7 +32,9 @@ import recipe
 from baselines import methods
 from tqdm import tqdm
 from withheld import cases, folders, page, plans, scoring
+from withheld.classes import class_of
 from withheld.comparison import compared
+from withheld.oracle import named_by_oracle
 from withheld.shrinkage import gaps_removed, true_shrinkage
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
@@ -60,6 +62,7 @@ class Withheld(recipe.Settings):
     tiers: str = ""  # such as T0=4,T2=10: cases by tier and robot; default of short or full
     threshold: float = 100.0  # detectability from which a cause counts as visible
     baselines: bool = False  # whether other methods answer too: about three times the time
+    oracle: bool = True  # whether one who knows parameters and strengths answers too
     short: bool = False
     resume: str = ""
 
@@ -174,7 +177,19 @@ def scored(
             shrinks = realised(out, name, report)
             one = scoring.record(labels[name], report, shrinks) | {"case": name}
             found.setdefault(method, []).append(one | {"removed": removed.get(method)})
+        if settings.oracle:
+            found[DIAGNOSIS][-1] |= ask_oracle(out / "cases" / name, labels[name])
     return found
+
+
+def ask_oracle(case: Path, label: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the oracle names, where one cause is true and it has an entry for it."""
+    true = [truth["name"] for truth in label["truths"]]
+    if label["tier"] not in {"T1", "T2", "T6"} or len(true) != 1:
+        return {}
+    system = System.load(case / "system.yaml")
+    said = named_by_oracle(system, read_logs(case, system), label)
+    return {"oracle": said, "oracle_class": class_of(said) == class_of(true[0])}
 
 
 def realised(out: Path, name: str, report: Mapping[str, Any]) -> float | None:

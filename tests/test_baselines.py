@@ -149,6 +149,15 @@ def test_what_goes_wrong_is_the_answer(tmp_path):
     assert set(found) == set(METHODS)
 
 
+def test_one_who_knows_all_strengths_names_the_cause(tmp_path, rubbing):
+    from withheld.folders import label
+    from withheld.oracle import named_by_oracle
+
+    system = System.load(written(rubbing, tmp_path) / "system.yaml")
+    said = named_by_oracle(system, read_logs(tmp_path, system), label(rubbing))
+    assert said == "coulomb_friction"
+
+
 def test_methods_are_compared_by_the_same_scores():
     from withheld.comparison import compared, comparison_table
 

@@ -64,6 +64,7 @@ class Case:
         motions: Logs.
         unseen: Noise-free motions of the same robot with new inputs.
         noise: Standard deviations told by the data sheet, ``(2 nv,)``, or nothing.
+        real_noise: Those of the sensors.
         velocities: Whether velocities are logged.
         effects: Names that the diagnosis may consider; nothing for all.
         detectability: See `detectability`.
@@ -77,6 +78,7 @@ class Case:
     motions: tuple[Motion, ...]
     unseen: tuple[Motion, ...]
     noise: Array | None
+    real_noise: Array
     velocities: bool
     effects: tuple[str, ...] | None
     detectability: float
@@ -128,8 +130,8 @@ def _make(plan: Plan, rng: np.random.Generator) -> Case:
     withheld = tuple(without_class_of(plan.causes[0])) if plan.tier == "T3" else None
     return Case(
         plan=plan, truths=tuple(t for _, t in made), theta=theta, priors=priors,
-        motions=tuple(motions), unseen=tuple(unseen), noise=told, velocities=velocities,
-        effects=withheld, detectability=visible, excitation=loops,
+        motions=tuple(motions), unseen=tuple(unseen), noise=told, real_noise=real,
+        velocities=velocities, effects=withheld, detectability=visible, excitation=loops,
     )  # fmt: skip
 
 

@@ -87,6 +87,7 @@ def label(case: Case) -> dict[str, Any]:
             for truth in case.truths
         ],
         "theta": case.theta,
+        "noise": case.real_noise.tolist(),
         "detectability": case.detectability,
         "excitation": case.excitation,
         "velocities": case.velocities,

@@ -27,8 +27,9 @@ def write_page(records: Sequence[Record], result: Mapping[str, Any], out: Path) 
         f"visible from a detectability of {result['threshold']:g}; intervals are Wilson's, 95 %.",
         *_against(result),
         table(result),
-        "By detectability (T1 and T2, class):",
-        _lines({k: {"top1_class": v} for k, v in result["by_detectability"].items()}),
+        "By detectability (T1 and T2, class), beside one who knows the parameters, the noise and "
+        "every strength, and names the likeliest effect of the catalogue:",
+        _strata(result),
         "![confusion of classes](confusion.png)",
         "![predicted and true shrinkage](calibration.png)",
         "## Failures",
@@ -69,6 +70,14 @@ def _lines(rows: Mapping[str, Mapping[str, Any]]) -> str:
             elif score in {"set_size", "mae", "median_error"} and value is not None:
                 lines.append(f"| {name} | {score} | {value:.2f} | | {scores['n']} |")
     return "\n".join(lines)
+
+
+def _strata(result: Mapping[str, Any]) -> str:
+    rows = {}
+    for stratum, score in result["by_detectability"].items():
+        known = result["oracle_by_detectability"][stratum]
+        rows[stratum] = {"diagnosis": score, "oracle": known}
+    return _lines(rows)
 
 
 def failed(one: Record) -> bool:

@@ -131,7 +131,8 @@ def scores(records: Sequence[Record], *, threshold: float) -> dict[str, Any]:
             robot: _tiers_of([r for r in records if r["robot"] == robot], threshold)
             for robot in sorted({r["robot"] for r in records})
         },
-        "by_detectability": _strata(records),
+        "by_detectability": _strata(records, "top1_class"),
+        "oracle_by_detectability": _strata(records, "oracle_class"),
         "where": {
             "channel": share(r["channel"] for r in known if "channel" in r),
             "joint": share(r["joint"] for r in known if "joint" in r and r["robot"] != "arm"),
@@ -197,12 +198,11 @@ def _tier(tier: str, every: Sequence[Record], visible: Sequence[Record]) -> dict
     return result
 
 
-def _strata(records: Sequence[Record]) -> dict[str, Any]:
+def _strata(records: Sequence[Record], score: str) -> dict[str, Any]:
+    """Return a score of T1 and T2 by how visible the cause is."""
     edges = (0.0, 10.0, 30.0, 100.0, 1000.0, math.inf)
-    single = [r for r in records if r["tier"] in {"T1", "T2"}]
+    single = [r for r in records if r["tier"] in {"T1", "T2"} and score in r]
     return {
-        f"{low:g} to {high:g}": share(
-            r["top1_class"] for r in single if low <= r["detectability"] < high
-        )
+        f"{low:g} to {high:g}": share(r[score] for r in single if low <= r["detectability"] < high)
         for low, high in pairwise(edges)
     }
