@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_bayessim.diagnosis.objective import Objective, Unit, units_of
+from torchrl_bayessim.diagnosis.objective import Objective, Unit, origin, units_of
 from torchrl_bayessim.diagnosis.prediction import Predictor
 from torchrl_bayessim.diagnosis.preparation import split
 from torchrl_bayessim.diagnosis.segments import Segments, cut
@@ -59,9 +59,8 @@ def whole_runs(system: System, logs: Sequence[Log]) -> Runs:
     names = list(CATALOGUE) if system.effects is None else system.effects
     every = units_of([effect(name) for name in names], system.robot)
     units = tuple(unit for unit in every if not unit.effect.random)
-    nominal = np.zeros(1 if system.prior is None else 1 + len(system.prior.names))
     predictor = with_fewest_steps(
-        Predictor(system, threads=1), runs["train"], units, z=nominal, noise=noise
+        Predictor(system, threads=1), runs["train"], units, z=origin(system.prior), noise=noise
     )
     sets = {
         name: Objective(predictor, system.prior, some, _divided_by(noise, some))

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from torchrl_bayessim.diagnosis.objective import (
     Point,
     Unit,
+    origin,
     parameters_at,
     strengths_of,
     units_of,
@@ -84,8 +85,7 @@ def gaps_removed(
     first = next(iter(able.values()))
     naming = {name: r["verdict"] in NAMING for name, r in able.items()}
     kinds = {n: "with_effects" if named else "without_effects" for n, named in naming.items()}
-    size = 1 if system.prior is None else 1 + len(system.prior.names)
-    prior = parameters_at(system.prior, np.zeros(size))
+    prior = parameters_at(system.prior, origin(system.prior))
     errors = _errors(
         system,
         _logs(unseen, logs[0], system),
