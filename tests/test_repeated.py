@@ -35,21 +35,22 @@ def script(folder, *, seed="0", cores="1"):
 
 
 def test_another_order_of_adding_is_told_with_its_size(repeated, tmp_path):
-    entries, differ, far = repeated.repeat(repeated.Case(script(tmp_path), ()), tmp_path)
-    assert (entries, differ) == (2, [])
-    assert far.keys() == {"real"}
-    assert 0 < far["real"] < 1e-14
+    found = repeated.repeat(repeated.Case(script(tmp_path), ()), tmp_path, threads=2)
+    assert (found["entries"], found["differing"]) == (2, [])
+    assert found["apart"].keys() == {"real"}
+    assert 0 < found["apart"]["real"] < 1e-14
 
 
 def test_draws_without_a_seed_are_found(repeated, tmp_path):
     case = repeated.Case(script(tmp_path, seed="None"), ())
-    assert repeated.repeat(case, tmp_path)[1] == ["result.json/real"]
+    found = repeated.repeat(case, tmp_path, threads=0)
+    assert found == {"entries": 2, "differing": ["result.json/real"]}
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="there is one core only")
 def test_what_depends_on_the_cores_is_found(repeated, tmp_path):
     case = repeated.Case(script(tmp_path, cores="len(os.sched_getaffinity(0))"), ())
-    assert repeated.repeat(case, tmp_path)[1] == ["result.json/cores"]
+    assert repeated.repeat(case, tmp_path, threads=0)["differing"] == ["result.json/cores"]
     assert len(os.sched_getaffinity(0)) > 1  # as before
 
 

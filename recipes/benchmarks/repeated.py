@@ -2,10 +2,12 @@
 
 Every recipe in its short setting three times: with one thread of torch and simulations on all
 cores; again on one core, which must give the same numbers, bit for bit and without times and paths;
-and with two threads of torch, which add in another order: how far the numbers of result.json are
+and with more threads of torch, which add in another order: how far the numbers of result.json are
 then apart. Prints one JSON line per recipe (half an hour on two busy cores)::
 
-    python recipes/benchmarks/repeated.py [sim2real_ppo ...]
+    python recipes/benchmarks/repeated.py [sim2real_ppo ...] [threads=2]
+
+``threads=0`` leaves the third run out, which takes long where others use the cores too.
 """
 
 from __future__ import annotations
@@ -17,10 +19,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from killed import RECIPES, Case, run
-from measuring import report
+from measuring import options, report
 from outputs import apart, differing, read
 
 SETTINGS = {
@@ -60,25 +63,33 @@ def one_core() -> Iterator[None]:
         os.sched_setaffinity(0, cores)
 
 
-def repeat(case: Case, folder: Path) -> tuple[int, list[str], dict[str, float]]:
-    """Return how many entries a run has, where a second one differs, and two threads how far."""
+def repeat(case: Case, folder: Path, *, threads: int) -> dict[str, Any]:
+    """Return how many entries a run has, where a second one differs, and how far more threads."""
     run(case, folder / "first")
     with one_core():
         run(case, folder / "again")
-    run(replace(case, settings=(*case.settings, "threads=2")), folder / "threads")
-    first, again, threads = (read(folder / name) for name in ("first", "again", "threads"))
-    return len(first), differing(first, again), apart(first, threads)
+    first = read(folder / "first")
+    found: dict[str, Any] = {
+        "entries": len(first),
+        "differing": differing(first, read(folder / "again")),
+    }
+    if threads:
+        run(replace(case, settings=(*case.settings, f"threads={threads}")), folder / "threads")
+        found["apart"] = apart(first, read(folder / "threads"))
+    return found
 
 
-def main(*names: str) -> None:
+def main(*arguments: str) -> None:
     """Repeat the recipes in turn."""
+    names = [name for name in arguments if "=" not in name]
+    given = options([a for a in arguments if "=" in a], optional=["threads"], threads=2)
     for name in names or SETTINGS:
         with tempfile.TemporaryDirectory() as folder:
             data = Path(folder, "data")
             data.mkdir()
-            entries, differ, far = repeat(made(name, data), Path(folder))
-        told = {"entries": entries, "differing": differ, "two_threads": far}
-        report("repeated", name, [len(differ)], unit="entries", seed=0, threads=1, **told)
+            found = repeat(made(name, data), Path(folder), threads=given["threads"])
+        count = len(found["differing"])
+        report("repeated", name, [count], unit="entries", seed=0, **given, **found)
 
 
 if __name__ == "__main__":
