@@ -12,7 +12,8 @@ opened, checked against the sum, and the reports are scored, once.
 Tiers: T0 no cause; T1 a cause as the catalogue has it; T2 the same cause in another form; T3 one
 whose class is withheld from the catalogue; T4 a cause that no catalogue has; T5 two causes; T6 the
 robot in another engine (MuJoCo with another integrator, cone and solver); controls: parameters at
-the edge of the prior, twice the noise of the data sheet, actions shuffled between trajectories.
+the edge of the prior, twice the noise of the data sheet, actions shuffled between trajectories,
+and the same case twice, the second time with every name drawn anew.
 ``baselines=true`` asks other methods too (see ``baselines/methods.py``), on the same folders.
 Causes below ``threshold`` (see ``withheld/detectability.py``) cannot be seen by anyone, and are
 left out of the scores of T1 to T6; ``by_detectability`` has them.
@@ -35,6 +36,7 @@ from withheld import cases, folders, page, plans, scoring
 from withheld.classes import class_of
 from withheld.comparison import compared
 from withheld.oracle import named_by_oracle
+from withheld.renaming import renamed, same_answer
 from withheld.shrinkage import gaps_removed, true_shrinkage
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
@@ -44,6 +46,7 @@ from torchrl_bayessim.logs.system import System
 from torchrl_bayessim.whole_file import replacing, write_text
 
 DIAGNOSIS = "diagnosis"
+RENAMED = "-renamed"  # after the name of a case that is handed over twice
 TIERS = ("T0", "T1", "T2", "T3", "T4", "T5", "T6", "controls")
 # Robots, and cases by tier and robot. What the issue of a release asks for takes longer than two
 # hours: robots=arm,two_links tiers=T0=150,T1=250,T2=250,T3=130,T4=40,T5=30,T6=20,controls=10
@@ -125,14 +128,25 @@ def generate(settings: Withheld, out: Path, *, robots: list[str], tiers: dict[st
         name = f"case{i:04d}"
         label = out / "sealed" / name / "label.json"
         if not label.exists():
-            case = cases.make(plan, np.random.default_rng([settings.seed, 1 + i]))
-            for file, text in folders.handed_over(case).items():
-                write_text(out / "cases" / name / file, text)
-            with replacing(label.with_name("unseen.npz")) as file:
-                file.write(folders.unseen(case))
-            write_text(label, json.dumps(folders.label(case)))
+            rng = np.random.default_rng([settings.seed, 1 + i])
+            case = cases.make(plan, rng)
+            write_case(out, name, case, rng)
         labels[name] = json.loads(label.read_text())
     write_text(out / "sealed" / "labels.json", json.dumps(labels, indent=1))
+
+
+def write_case(out: Path, name: str, case: cases.Case, rng: np.random.Generator) -> None:
+    """Write what the diagnosis is given, once more under other names if so planned, and seal."""
+    sealed, label, files = out / "sealed" / name, folders.label(case), folders.handed_over(case)
+    written = {name: files}
+    if case.plan.control == "renamed":
+        written[name + RENAMED], label["names"] = renamed(files, rng)
+    for folder, texts in written.items():
+        for file, text in texts.items():
+            write_text(out / "cases" / folder / file, text)
+    with replacing(sealed / "unseen.npz") as file:
+        file.write(folders.unseen(case))
+    write_text(sealed / "label.json", json.dumps(label))
 
 
 def examine(case: Path, report: Path, *, seed: int) -> None:
@@ -166,10 +180,9 @@ def scored(
     """Return the records of all cases, of the diagnosis and of the baselines if they were asked."""
     found: dict[str, list[dict[str, Any]]] = {}
     for name in sorted(labels):
-        reports = {DIAGNOSIS: json.loads((out / "reports" / f"{name}.json").read_text())}
+        reports = reports_of(out, name, baselines=settings.baselines)
         removed: Mapping[str, float | None] = {}
         if settings.baselines:
-            reports |= json.loads((out / "baselines" / f"{name}.json").read_text())
             system = System.load(out / "cases" / name / "system.yaml")
             logs = read_logs(out / "cases" / name, system)
             removed = gaps_removed(system, logs, out / "sealed" / name / "unseen.npz", reports)
@@ -177,9 +190,22 @@ def scored(
             shrinks = realised(out, name, report)
             one = scoring.record(labels[name], report, shrinks) | {"case": name}
             found.setdefault(method, []).append(one | {"removed": removed.get(method)})
+        if "names" in labels[name]:
+            others = reports_of(out, name + RENAMED, baselines=settings.baselines)
+            for method, other in others.items():
+                same = same_answer(reports[method], other, labels[name]["names"])
+                found[method][-1]["same"] = same
         if settings.oracle:
             found[DIAGNOSIS][-1] |= ask_oracle(out / "cases" / name, labels[name])
     return found
+
+
+def reports_of(out: Path, name: str, *, baselines: bool) -> dict[str, dict[str, Any]]:
+    """Return what was said of a case, by method."""
+    said = {DIAGNOSIS: json.loads((out / "reports" / f"{name}.json").read_text())}
+    if baselines:
+        said |= json.loads((out / "baselines" / f"{name}.json").read_text())
+    return said
 
 
 def ask_oracle(case: Path, label: Mapping[str, Any]) -> dict[str, Any]:

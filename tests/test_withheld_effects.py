@@ -16,7 +16,7 @@ import pytest
 RECIPES = Path(__file__).parent.parent / "recipes"
 GENERATOR = {
     *("robots", "plant", "laws", "classes", "excitation", "detectability", "cases", "plans"),
-    *("causes_actuation", "causes_body", "causes_foreign", "causes_sensing", "folders"),
+    *("causes_actuation", "causes_body", "causes_foreign", "causes_sensing", "folders", "renaming"),
 }
 
 
@@ -280,6 +280,42 @@ def test_a_label_knows_what_a_joint_its_motor_and_its_body_are_called():
 
     case = make(Plan("T1", "cart_pole", ("dead_band",)), np.random.default_rng(0))
     assert label(case)["truths"][0]["places"] == ["rail", "drive", "cart"]
+
+
+def test_a_renamed_case_is_the_same_case_and_told_from_another(tmp_path):
+    from dataclasses import replace
+
+    from withheld.cases import Plan, make
+    from withheld.folders import handed_over
+    from withheld.renaming import renamed, same_answer
+
+    from torchrl_bayessim.diagnosis.diagnose import diagnose
+    from torchrl_bayessim.logs.read import read_logs
+    from torchrl_bayessim.logs.system import System
+
+    case = make(Plan("renamed", "two_links", ("action_bias",)), np.random.default_rng(4))
+    short = [replace(m, measured=m.measured[:90], ctrl=m.ctrl[:90]) for m in case.motions[:3]]
+    few = replace(case, motions=tuple(short), effects=("action_bias", "coulomb_friction"))
+    plain = handed_over(few)
+    other, names = renamed(plain, np.random.default_rng(0))
+    assert not any(name in text for text in other.values() for name in names if len(name) > 3)
+    reports = []
+    for folder, files in (("plain", plain), ("other", other)):
+        (tmp_path / folder).mkdir()
+        for file, text in files.items():
+            (tmp_path / folder / file).write_text(text)
+        system = System.load(tmp_path / folder / "system.yaml")
+        logs = read_logs(tmp_path / folder, system)
+        reports.append(diagnose(system, None, logs).to_dict())
+    found, again = reports
+    assert [e["name"] for e in found["effects"]] == ["action_bias"]
+    assert found["effects"][0]["where"] != again["effects"][0]["where"]
+    assert same_answer(found, again, names)
+    elsewhere = {name: name[::-1] for name in names}
+    assert not same_answer(found, again, elsewhere)
+    assert not same_answer(found, found | {"verdict": "none"}, {})
+    weaker = [found["effects"][0] | {"strength": 0.5 * found["effects"][0]["strength"]}]
+    assert not same_answer(found, found | {"effects": weaker}, {})
 
 
 def test_wilson_intervals():

@@ -41,7 +41,8 @@ class Plan:
         form: ``same`` as the catalogue's, or ``other``.
         engine: ``fine`` or ``other``: another integrator, cone and solver.
         control: ``parameters`` at the edge of the prior, ``noise`` twice that of the data sheet,
-            actions ``shuffled`` between trajectories, or nothing.
+            actions ``shuffled`` between trajectories, handed over once more with all names
+            ``renamed``, or nothing.
     """
 
     tier: str

@@ -84,6 +84,8 @@ def failed(one: Record) -> bool:
     """Return whether a case counts against the diagnosis."""
     if one["verdict"] == "crash":
         return True
+    if one["tier"] == "renamed":
+        return not one.get("same", True)
     if one["tier"] in {"T3", "T4", "shuffled"} or (one["tier"] == "T6" and not one["truth"]):
         return one["verdict"] == "named"
     if not one["truth"]:

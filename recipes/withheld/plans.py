@@ -15,7 +15,8 @@ from .causes_foreign import FOREIGN
 from .causes_sensing import SENSING
 from .classes import class_of
 
-CONTROLS = ("parameters", "noise", "shuffled")
+CONTROLS = ("parameters", "noise", "shuffled", "renamed")
+_OF_GYMNASIUM = {"hopper", "half_cheetah"}
 _OTHER_ONLY = {"backlash", "series_elasticity"}  # of two masses, unlike the catalogue's
 _SAME_ONLY = {"armature", "com_shift"}
 
@@ -23,7 +24,7 @@ _SAME_ONLY = {"armature", "com_shift"}
 def applicable(robot: str, form: str = "same") -> list[str]:
     """Return the causes that a robot can have in a form."""
     names = {**ACTUATION, **BODY, **SENSING}
-    if robot in {"hopper", "half_cheetah"}:
+    if robot in _OF_GYMNASIUM:
         names |= CONTACT
     left = _OTHER_ONLY if form == "same" else _SAME_ONLY
     if robot == "cart_pole":
@@ -51,7 +52,11 @@ def _tier(tier: str, robot: str, count: int, rng: np.random.Generator) -> list[P
     if tier == "T0":
         return [Plan(tier, robot)] * count
     if tier == "controls":
-        return [Plan(name, robot, control=name) for name in CONTROLS for _ in range(count)]
+        plain = [Plan(name, robot, control=name) for name in CONTROLS[:3] for _ in range(count)]
+        if robot in _OF_GYMNASIUM:  # whose names are Gymnasium's
+            return plain
+        return plain + [Plan("renamed", robot, (n,), control="renamed")
+                        for n in _deal(same, count, rng)]  # fmt: skip
     if tier == "T5":
         return [_pair(robot, rng) for _ in range(count)]
     if tier == "T6":

@@ -169,6 +169,8 @@ def _tier(tier: str, every: Sequence[Record], visible: Sequence[Record]) -> dict
         low = share(r["p_value"] < 0.05 for r in mine if r["p_value"] is not None)
         alarms = share(alarm(r) for r in mine)
         return {"n": len(mine), "false_alarm": alarms, "p_below_5_percent": low}
+    if tier == "renamed":
+        return {"n": len(mine), "same": share(r["same"] for r in mine if "same" in r)}
     if tier == "shuffled":
         return {"n": len(mine), "wrong_named": share(r["verdict"] == "named" for r in mine)}
     if tier in {"T3", "T4"}:
