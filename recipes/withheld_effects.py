@@ -36,6 +36,7 @@ from withheld import cases, folders, page, plans, scoring
 from withheld.classes import class_of
 from withheld.comparison import compared
 from withheld.oracle import named_by_oracle
+from withheld.regime_overlap import overlap
 from withheld.renaming import renamed, same_answer
 from withheld.shrinkage import gaps_removed, true_shrinkage
 
@@ -190,6 +191,7 @@ def scored(
             shrinks = realised(out, name, report)
             one = scoring.record(labels[name], report, shrinks) | {"case": name}
             found.setdefault(method, []).append(one | {"removed": removed.get(method)})
+        found[DIAGNOSIS][-1]["regime"] = regime_of(out, name, reports[DIAGNOSIS])
         if "names" in labels[name]:
             others = reports_of(out, name + RENAMED, baselines=settings.baselines)
             for method, other in others.items():
@@ -226,6 +228,13 @@ def realised(out: Path, name: str, report: Mapping[str, Any]) -> float | None:
     system = System.load(case / "system.yaml")
     logs = read_logs(case, system)
     return true_shrinkage(system, logs, out / "sealed" / name / "unseen.npz", report)
+
+
+def regime_of(out: Path, name: str, report: Mapping[str, Any]) -> dict[str, float] | None:
+    """Return how the rule that a report gives overlaps with when the cause acts."""
+    case = out / "cases" / name
+    system = System.load(case / "system.yaml")
+    return overlap(system, read_logs(case, system), out / "sealed" / name / "unseen.npz", report)
 
 
 if __name__ == "__main__":

@@ -318,6 +318,62 @@ def test_a_renamed_case_is_the_same_case_and_told_from_another(tmp_path):
     assert not same_answer(found, found | {"effects": weaker}, {})
 
 
+def test_it_is_noted_when_a_cause_acts():
+    from withheld.causes_actuation import dead_band, saturation
+    from withheld.causes_body import directional, tilt
+
+    wave = 4.0 * np.sin(np.arange(50) / 4)
+    cut, truth = saturation(site())
+    motion = run(cut, commands=wave, still=True)
+    top = 4.0 * (1 - truth.strength["fraction"])
+    np.testing.assert_allclose(motion.acts[:, 0], np.maximum(np.abs(wave) - top, 0.0), atol=1e-9)
+    both = run(dead_band(site())[0], directional(site())[0], commands=wave, still=True)
+    assert both.acts.shape == (50, 2)
+    assert (both.acts.max(0) > 0).all()
+    assert not run(tilt(site())[0], commands=wave).acts.any()
+
+
+def test_rules_overlap_with_when_a_cause_acts(tmp_path):
+    import torch
+    from withheld.regime_overlap import overlap, rows_of_rule, times_of_action
+
+    from torchrl_bayessim.envs.tasks.catalogue import known_task
+    from torchrl_bayessim.logs.log import Log
+    from torchrl_bayessim.logs.system import System
+
+    rows = rows_of_rule("|v| < 2 & t >= 1", {"|v|": np.r_[1.0, 3, 1, 2], "t": np.r_[0.0, 1, 2, 3]})
+    assert rows.tolist() == [False, False, True, False]
+    with pytest.raises(ValueError, match="expected a rule"):
+        rows_of_rule("w < 2", {"v": np.zeros(2)})
+    assert times_of_action([np.array([0.0, 0.1]), np.array([1.0, 0.2])])[0].tolist() == [False] * 2
+
+    system = System(task=known_task("InvertedPendulum-v5"))
+    zeros = torch.zeros(101, 2).double()
+    time = system.control_dt * torch.arange(101).double()
+    log = Log(
+        name="run00", time=time, qpos=zeros, qvel=zeros, ctrl=zeros[:, :1],
+        velocity_gain=torch.zeros(2).double(), measured=torch.ones(4).bool(),
+    )  # fmt: skip
+    np.savez(tmp_path / "acts.npz", acts0=(np.arange(101) >= 50.0)[:, None])
+    for begins, iou in ((50, 1.0), (75, 0.5), (0, 0.5)):
+        # a rule speaks of the row after the step
+        rule = f"time >= {system.control_dt * (begins + 0.5):.6g}"
+        report = {"where": {"regimes": [{"rule": rule}]}}
+        found = overlap(system, [log], tmp_path / "acts.npz", report)
+        assert found["iou"] == pytest.approx(iou, abs=0.02)
+        assert found["of_no_rule"] == 0.5
+    assert overlap(system, [log], tmp_path / "acts.npz", {"where": {"regimes": []}}) is None
+
+
+def test_p_values_are_tested_for_uniformity():
+    from withheld.scoring import uniform
+
+    even = (np.arange(100) + 0.5) / 100
+    assert uniform(even.tolist())["statistic"] == pytest.approx(0.005)
+    assert uniform((even**3).tolist())["p_value"] < 1e-6
+    assert uniform([0.5])["p_value"] is None
+
+
 def test_wilson_intervals():
     from withheld.scoring import wilson
 

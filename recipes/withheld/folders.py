@@ -54,8 +54,13 @@ def handed_over(case: Case) -> dict[str, str]:
 
 
 def unseen(case: Case) -> bytes:
-    """Return noise-free motions with new inputs, for the true shrinkage; sealed with the labels."""
+    """Return what is sealed with the labels, as a compressed file of arrays.
+
+    Noise-free motions with new inputs, for the true shrinkage, and when the causes act in the runs
+    that are handed over.
+    """
     arrays = {f"clean{i}": m.clean for i, m in enumerate(case.unseen)}
+    arrays |= {f"acts{i}": m.acts for i, m in enumerate(case.motions)}
     arrays |= {f"ctrl{i}": m.ctrl for i, m in enumerate(case.unseen)}
     file = io.BytesIO()
     np.savez_compressed(file, **arrays)

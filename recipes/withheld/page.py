@@ -17,6 +17,7 @@ from .classes import CLASSES
 from .comparison import comparison_table
 
 Record = dict[str, Any]
+_PLAIN = {"set_size", "mae", "median_error", "iou", "of_no_rule"}  # scores without an interval
 
 
 def write_page(records: Sequence[Record], result: Mapping[str, Any], out: Path) -> None:
@@ -54,6 +55,7 @@ def table(result: Mapping[str, Any]) -> str:
     for robot, tiers in result["by_robot"].items():
         rows |= {f"{tier} {robot}": scores for tier, scores in tiers.items()}
     rows["where"] = result["where"]
+    rows["regime"] = result["regime"]
     rows["shrinkage"] = result["shrinkage"]
     rows["strength"] = result["strength"]
     return _lines(rows)
@@ -67,7 +69,10 @@ def _lines(rows: Mapping[str, Mapping[str, Any]]) -> str:
                 low, high = value["ci95"]
                 text = f"{value['value']:.2f} | {low:.2f} to {high:.2f} | {value['n']}"
                 lines.append(f"| {name} | {score} | {text} |")
-            elif score in {"set_size", "mae", "median_error"} and value is not None:
+            elif score == "p_uniform" and value["p_value"] is not None:
+                said = f"D = {value['statistic']:.2f} | p = {value['p_value']:.2f}"
+                lines.append(f"| {name} | Kolmogorov-Smirnov | {said} | {value['n']} |")
+            elif score in _PLAIN and value is not None:
                 lines.append(f"| {name} | {score} | {value:.2f} | | {scores['n']} |")
     return "\n".join(lines)
 

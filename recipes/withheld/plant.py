@@ -56,12 +56,15 @@ class Motion:
         measured: With noise.
         qpos: Where ``clean`` begins from: positions of the model, with what the sensors add.
         ctrl: Logged commands, ``(T, nu)``.
+        acts: How much each cause changes, the largest in every control step, ``(T, causes)``:
+            of commands, of forces, of what is measured; 0 throughout for a change of the model.
     """
 
     clean: Array
     measured: Array
     qpos: Array
     ctrl: Array
+    acts: Array
 
 
 @dataclass
@@ -84,6 +87,7 @@ class Plant:
     data: mujoco.MjData = field(init=False)
     commands: list[Array] = field(init=False, default_factory=list)
     states: list[Array] = field(init=False, default_factory=list)
+    acts: list[Array] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
         for cause in self.causes:
@@ -120,12 +124,13 @@ class Plant:
         """
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:], self.data.qvel[:] = q, v
-        self.commands, self.states = [], []
+        self.commands, self.states, self.acts = [], [], []
         for cause in self.causes:
             cause.memory.clear()
         mujoco.mj_forward(self.model, self.data)
         clean, measured = [], []
         for k in range(steps):
+            self.acts.append(np.zeros(len(self.causes)))
             clean.append(self._read())
             measured.append(clean[-1] + self.noise * self.rng.standard_normal(len(self.noise)))
             self.commands.append(np.asarray(policy(k, measured[-1]), dtype=np.float64))
@@ -134,22 +139,36 @@ class Plant:
         rows, nv = np.array(clean), self.model.nv
         if not np.isfinite(rows).all() or np.abs(rows).max() > 1e3:
             raise FloatingPointError("the simulation diverged")
-        return Motion(rows, np.array(measured), rows[:, :nv], np.array(self.commands))
+        acts = np.array(self.acts).reshape(steps, len(self.causes))
+        return Motion(rows, np.array(measured), rows[:, :nv], np.array(self.commands), acts)
 
     def _read(self) -> Array:
         y = np.concatenate([self.q, self.v])
         self.states.append(y)
-        for cause in self.causes:
-            y = cause.sense(y, self)
+        for i, cause in enumerate(self.causes):
+            seen = cause.sense(y, self)
+            self._acted(i, seen - y)
+            y = seen
         return y
 
     def _step(self) -> None:
         u = self.commands[-1]
-        for cause in self.causes:
-            u = cause.command(u, self)
+        for i, cause in enumerate(self.causes):
+            arrives = cause.command(u, self)
+            self._acted(i, arrives - u)
+            u = arrives
         self.data.ctrl[:] = u
-        self.data.qfrc_applied[:] = sum((c.force(self) for c in self.causes), 0.0)
+        self.data.qfrc_applied[:] = 0.0
+        for i, cause in enumerate(self.causes):
+            force = cause.force(self)
+            self._acted(i, force)
+            self.data.qfrc_applied += force
         mujoco.mj_step(self.model, self.data)
+
+    def _acted(self, cause: int, change: Array | float) -> None:
+        """Note how much a cause changed."""
+        largest = float(np.max(np.abs(change)))
+        self.acts[-1][cause] = max(self.acts[-1][cause], largest)
 
 
 @dataclass(frozen=True)

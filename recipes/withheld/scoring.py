@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-__all__ = ["NAMING", "Record", "finite", "record", "scores", "share", "wilson"]
+__all__ = ["NAMING", "Record", "finite", "record", "scores", "share", "uniform", "wilson"]
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
+
+from scipy.stats import kstest
 
 from .classes import class_of
 
@@ -137,6 +139,7 @@ def scores(records: Sequence[Record], *, threshold: float) -> dict[str, Any]:
             "channel": share(r["channel"] for r in known if "channel" in r),
             "joint": share(r["joint"] for r in known if "joint" in r and r["robot"] != "arm"),
         },
+        "regime": _regime([r["regime"] for r in known if r.get("regime")]),
         "strength": {
             "n": len(strengths),
             "median_error": strengths[len(strengths) // 2] if strengths else None,
@@ -146,6 +149,25 @@ def scores(records: Sequence[Record], *, threshold: float) -> dict[str, Any]:
         "crashes": share(r["verdict"] == "crash" for r in records),
         "seconds_per_case": sum(r["seconds"] for r in records) / len(records),
     }
+
+
+def _regime(pairs: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    """Return how well rules overlap with when causes act, beside what no rule would."""
+    n = len(pairs)
+    found: dict[str, Any] = {"n": n, "better_than_no_rule": share(
+        pair["iou"] > pair["of_no_rule"] for pair in pairs
+    )}  # fmt: skip
+    for name in ("iou", "of_no_rule"):
+        found[name] = sum(pair[name] for pair in pairs) / n if n else None
+    return found
+
+
+def uniform(p_values: Sequence[float]) -> dict[str, Any]:
+    """Return the Kolmogorov-Smirnov test of p-values that should be uniform."""
+    if len(p_values) < 2:
+        return {"n": len(p_values), "statistic": None, "p_value": None}
+    test = kstest(p_values, "uniform")
+    return {"n": len(p_values), "statistic": test.statistic, "p_value": test.pvalue}
 
 
 def _shrinkage(pairs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -166,9 +188,13 @@ def _tier(tier: str, every: Sequence[Record], visible: Sequence[Record]) -> dict
     seen = [r for r in visible if r["tier"] == tier]
     alarm: Callable[[Record], bool] = lambda r: r["verdict"] not in {"none", "not_testable"}
     if tier in {"T0", "parameters", "noise"}:
-        low = share(r["p_value"] < 0.05 for r in mine if r["p_value"] is not None)
-        alarms = share(alarm(r) for r in mine)
-        return {"n": len(mine), "false_alarm": alarms, "p_below_5_percent": low}
+        known = [r["p_value"] for r in mine if r["p_value"] is not None]
+        return {
+            "n": len(mine),
+            "false_alarm": share(alarm(r) for r in mine),
+            "p_below_5_percent": share(p < 0.05 for p in known),
+            "p_uniform": uniform(known),
+        }
     if tier == "renamed":
         return {"n": len(mine), "same": share(r["same"] for r in mine if "same" in r)}
     if tier == "shuffled":

@@ -138,7 +138,7 @@ def _logs(unseen: Path, like: Log, system: System) -> list[Log]:
     """Return the noise-free motions as logs of which as much was measured as of ``like``."""
     made = []
     with np.load(unseen) as arrays:
-        for i in range(len(arrays.files) // 2):
+        for i in range(sum(name.startswith("clean") for name in arrays.files)):
             clean, ctrl = (torch.from_numpy(arrays[f"{kind}{i}"]) for kind in ("clean", "ctrl"))
             nv = clean.shape[1] // 2
             made.append(
