@@ -16,7 +16,15 @@ import pytest
 RECIPES = Path(__file__).parent.parent / "recipes"
 GENERATOR = {
     *("robots", "plant", "laws", "classes", "excitation", "detectability", "cases", "plans"),
-    *("causes_actuation", "causes_body", "causes_foreign", "causes_sensing", "folders", "renaming"),
+    *(
+        "causes_actuation",
+        "causes_body",
+        "causes_foreign",
+        "causes_sensing",
+        "causes_chance",
+        "folders",
+        "renaming",
+    ),
 }
 
 
@@ -210,6 +218,53 @@ def test_sensors_say_what_the_label_says():
         q, v = true.clean.T
         expectation = np.stack(expected(truth.strength, q, v, 0.02 * np.arange(50)), 1)
         np.testing.assert_allclose(seen.clean, expectation, atol=1e-9)
+
+
+@pytest.mark.parametrize("form", ["same", "other"])
+def test_as_much_is_lost_as_the_label_says(form):
+    from withheld.causes_chance import packet_drop, sensor_dropout
+
+    wave = 1e-3 * (np.arange(4000.0) % 7 - 3)
+    drop, truth = packet_drop(site(form))
+    robot = plant(drop, still=True, timestep=0.02)
+    share = packet_drop(site())[1].strength["probability"]
+    robot.run(np.zeros(1), np.zeros(1), lambda k, _: wave[k : k + 1], steps=4000)
+    lost = np.array(robot.acts)[:, 0] > 0  # the wave changes in every step
+    assert lost.mean() == pytest.approx(share, rel=0.1)
+    again = (lost[1:] & lost[:-1]).mean() / lost.mean()
+    assert again == pytest.approx(share if form == "same" else 0.5, abs=0.05)
+    assert truth.name == "packet_drop"
+    stale, truth = sensor_dropout(site(form))
+    share = sensor_dropout(site())[1].strength["probability"]
+    seen = plant(stale, still=True, timestep=0.02).run(
+        np.zeros(1), np.array([0.5]), lambda *_: np.zeros(1), steps=4000
+    )
+    assert (np.diff(seen.clean[:, 0]) == 0).mean() == pytest.approx(share, rel=0.1)
+
+
+def test_jitter_is_late_by_half_its_range_on_average_and_torque_noise_is_white():
+    from withheld.causes_chance import action_jitter, torque_noise
+
+    ramp = 0.001 * np.arange(4000.0)
+    for form in ("same", "other"):
+        cause, _ = action_jitter(site(form))
+        seconds = action_jitter(site())[1].strength["s"]
+        robot, arrived = plant(cause, still=True, timestep=0.02), []
+        for k in range(2000):
+            robot.commands.append(ramp[k : k + 1])
+            arrived.append(cause.command(ramp[k : k + 1], robot)[0])
+        late = 0.02 * (ramp[100:2000] - arrived[100:]) / 0.001
+        assert late.mean() == pytest.approx(seconds / 2, rel=0.05)
+        assert late.max() == pytest.approx(seconds, rel=0.01)
+    cause, truth = torque_noise(site())
+    robot, forces = plant(cause, timestep=0.02), []
+    for _ in range(2000):
+        robot.commands.append(np.zeros(1))
+        forces.append(cause.force(robot)[0])
+        assert cause.force(robot)[0] == forces[-1]  # until the next control step
+    assert abs(np.corrcoef(forces[1:], forces[:-1])[0, 1]) < 0.07
+    assert 0.02 * 4 < np.std(forces) < 0.2 * 4 * 1.1
+    assert truth.strength == {}
 
 
 def test_payload_at_the_tip_has_the_inertia_of_a_point():

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from .causes_actuation import ACTUATION
 from .causes_body import BODY, CONTACT
+from .causes_chance import CHANCE
 from .causes_foreign import FOREIGN
 from .causes_sensing import SENSING
 from .classes import without_class_of
@@ -23,7 +24,7 @@ from .plant import Motion, Plant, Policy, Truth
 from .robots import ROBOTS, Robot, nominal_model, write_entry
 
 Array = NDArray[np.float64]
-CAUSES = ACTUATION | BODY | CONTACT | SENSING | FOREIGN
+CAUSES = ACTUATION | BODY | CONTACT | SENSING | CHANCE | FOREIGN
 # What no data can tell from a parameter: the prior then is over the others.
 _LIKE_MASSES = {"action_gain", "payload", "armature", "com_shift", "link_length"}
 _LIKE_DAMPINGS = {"viscous_friction"}

@@ -6,6 +6,7 @@ __all__ = ["FOREIGN"]
 
 import math
 
+from .causes_chance import torque_noise
 from .laws import Commands, Forces, Made, Site
 from .plant import Plant
 
@@ -77,5 +78,5 @@ def event(site: Site) -> Made:
 
 FOREIGN = {
     "tight_spot": tight_spot, "soft_stop": soft_stop, "cable": cable, "detent": detent,
-    "thermal": thermal, "event": event,
+    "thermal": thermal, "event": event, "torque_noise": torque_noise,
 }  # fmt: skip

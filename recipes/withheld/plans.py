@@ -11,6 +11,7 @@ import numpy as np
 from .cases import Plan
 from .causes_actuation import ACTUATION
 from .causes_body import BODY, CONTACT
+from .causes_chance import CHANCE
 from .causes_foreign import FOREIGN
 from .causes_sensing import SENSING
 from .classes import class_of
@@ -23,7 +24,7 @@ _SAME_ONLY = {"armature", "com_shift"}
 
 def applicable(robot: str, form: str = "same") -> list[str]:
     """Return the causes that a robot can have in a form."""
-    names = {**ACTUATION, **BODY, **SENSING}
+    names = {**ACTUATION, **BODY, **SENSING, **CHANCE}
     if robot in _OF_GYMNASIUM:
         names |= CONTACT
     left = _OTHER_ONLY if form == "same" else _SAME_ONLY

@@ -45,7 +45,9 @@ _HISTORY = 0.4  # s of commands before a segment
 def true_shrinkage(
     system: System, logs: Sequence[Log], unseen: Path, report: Mapping[str, Any]
 ) -> float | None:
-    """Return the share of the gap that the named effects remove; ``None`` where none was named.
+    """Return the share of the gap that the named effects remove.
+
+    ``None`` where none was named, or one of chance: no simulation repeats what chance did.
 
     Args:
         system: The nominal system of the case.
@@ -53,7 +55,7 @@ def true_shrinkage(
         unseen: File with the motions.
         report: Of the diagnosis.
     """
-    if not report.get("effects"):
+    if not report.get("effects") or any(effect(e["name"]).random for e in report["effects"]):
         return None
     theta = np.array([_theta(report, kind) for kind in ("without_effects", "with_effects")])
     strengths = [{}, _named(system, report)]
@@ -103,13 +105,14 @@ def _theta(report: Mapping[str, Any], kind: str) -> list[float]:
 
 
 def _named(system: System, report: Mapping[str, Any]) -> dict[Unit, float]:
-    """Return the strengths that a report names, at single targets."""
-    names = dict.fromkeys(found["name"] for found in report["effects"])
+    """Return the strengths that a report names, at single targets; none of chance."""
+    lasting = [found for found in report["effects"] if not effect(found["name"]).random]
+    names = dict.fromkeys(found["name"] for found in lasting)
     units = units_of([effect(name) for name in names], system.robot)
     by_place = {(unit.name, unit.where): unit for unit in units}
     return {
         by_place[found["name"], where]: strength
-        for found in report["effects"]
+        for found in lasting
         for where, strength in found["strengths"].items()
     }
 
