@@ -75,7 +75,8 @@ def constraints(name: str, given: dict[str, str]) -> Iterator[str]:
     """Yield the versions of an environment: its lower bounds, and those given."""
     for requirement in requirements(*EXTRAS) if name == "low" else ():
         if package(requirement) not in given:
-            yield requirement.split(",")[0].replace(">=", "==")
+            lower = requirement.split(",")[0].replace(">=", "==")
+            yield re.sub(r"\[.*\]", "", lower)  # constraints have no extras
     yield from (f"{one}=={version}" for one, version in given.items())
 
 
