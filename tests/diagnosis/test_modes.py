@@ -1,6 +1,7 @@
-"""What is predicted: segments, or whole trajectories. The same answers are known."""
+"""What is predicted: segments, whole trajectories, statistics. The same answers are known."""
 
 import json
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -88,6 +89,30 @@ def test_trajectories_are_shorter_where_they_are_chaotic():
     assert 24 <= steps <= 200
     quiet = {**given, "noise": np.full(4, 1e-6)}
     assert Trajectories().horizon(predictor, {"train": logs}, **quiet) > steps
+
+
+def unsynchronised(seed, late=5, **cause):
+    """Return a log whose sensors show what was so many rows ago."""
+    log = logged(seed, rows=300 + late, **cause)
+    states = {name: getattr(log, name)[:-late] for name in ("qpos", "qvel")}
+    return replace(log, time=log.time[:-late], ctrl=log.ctrl[late:], **states)
+
+
+def test_clocks_that_are_apart_are_no_cause_where_statistics_are_compared(tmp_path):
+    logs = [unsynchronised(seed) for seed in range(5)]
+    report = diagnose(arm(tmp_path), None, logs, effects=FEW, mode="summaries")
+    assert report.verdict == "none"
+    assert report.gap.refit < 1.5
+    by_rows = diagnose(arm(tmp_path), None, logs, effects=FEW)
+    assert by_rows.verdict != "none"
+
+
+def test_friction_is_named_though_clocks_are_apart(tmp_path):
+    logs = [unsynchronised(seed, friction=FRICTION) for seed in range(5)]
+    report = diagnose(arm(tmp_path), None, logs, effects=FEW, mode="summaries")
+    assert report.effects[0].name == "coulomb_friction"
+    assert report.effects[0].strength == pytest.approx(FRICTION, rel=0.2)
+    assert "delays are not looked for" in report.alarms[0]
 
 
 def test_the_recipe_takes_a_mode(tmp_path):

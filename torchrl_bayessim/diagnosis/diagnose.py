@@ -58,7 +58,8 @@ def diagnose(
         effects: Names from the catalogue, or effects of your own; default the system's, or all.
         findings: Of the sanity gate, to be repeated in the report.
         mode: What is predicted and compared: ``segments`` from measured states; ``trajectories``
-            from their first row on, where states cannot be set or hidden ones live long.
+            from their first row on, where states cannot be set or hidden ones live long;
+            ``summaries``, statistics of windows, where clocks are not synchronised or chaos rules.
         horizon: Control steps that are predicted at a time; default chosen from the data.
         seed: Of the bootstrap and of the null distribution's draws.
         progress: Told what is done.
@@ -74,16 +75,16 @@ def diagnose(
     system = _system(simulator, prior)
     chosen = _effects(system, effects, logs)
     every = units_of(chosen, system.robot)
-    units = [unit for unit in every if not unit.effect.random]
+    told = MODES[mode]()
+    units = [u for u in every if not u.effect.random and u.name not in told.untestable]
     generator = np.random.default_rng(seed)
     # many small matrices: threads of their own cost more than they bring
     with threadpool_limits(1, user_api="blas"):
         progress("fitting the parameters")
         bridges, holds = bridged(logs, system.robot) if _asks_for_holds(every) else (logs, [])
-        prepared = prepare(
-            system, bridges, units, generator=generator, mode=MODES[mode](), horizon=horizon
-        )
-        units = _with_shapes(system, prepared, units)
+        prepared = prepare(system, bridges, units, generator=generator, mode=told, horizon=horizon)
+        if prepared.mode.synchronised:
+            units = _with_shapes(system, prepared, units)
         units = with_onsets(prepared.sets["train"], prepared.nominal.point, units)
         selection = select(
             prepared.sets["train"],

@@ -124,7 +124,7 @@ def _signature(prepared: Prepared, selection: Selection) -> dict[str, Any]:
     """
     train, robot = prepared.sets["train"], prepared.predictor.system.robot
     pushes = pushes_of(robot)
-    if not pushes:
+    if not pushes or not prepared.mode.synchronised:
         return {}
     before_fit, after_fit = selection.nominal.fit, selection.best.fit
     short = _shortened(train.segments)

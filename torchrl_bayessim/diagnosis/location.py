@@ -38,10 +38,14 @@ def location(
     robot = judged[0].predictor.system.robot
     beyond = excess(*judged)
     by_output = np.maximum(beyond.mean((0, 1)), 0.0)
-    rules = regimes(
-        (features(train[0].segments, robot), excess(*train).mean(-1)),
-        (features(judged[0].segments, robot), beyond.mean(-1)),
-    )
+    rules, over_time = [], []
+    if judged[0].located:
+        rules = regimes(
+            (features(train[0].segments, robot), excess(*train).mean(-1)),
+            (features(judged[0].segments, robot), beyond.mean(-1)),
+        )
+        times = judged[0].segments.time[:, judged[0].segments.rows]
+        over_time = _over_time(times, beyond.mean(-1))
     gains = dict(found) or _gains(seen)
     channels: dict[str, float] = dict.fromkeys(_CHANNELS, 0.0)
     joints = dict.fromkeys(robot.joints, 0.0)
@@ -56,7 +60,7 @@ def location(
         "outputs": _named(dict(zip(robot.channels, by_output.tolist(), strict=True))),
         "joints": _named(joints),
         "regimes": [{"rule": r.rule, "support": r.support, "share": r.share} for r in rules[:4]],
-        "time": _over_time(judged[0].segments.time[:, judged[0].segments.rows], beyond.mean(-1)),
+        "time": over_time,
     }
 
 

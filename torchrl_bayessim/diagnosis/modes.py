@@ -1,4 +1,4 @@
-"""What is predicted and compared: short segments, or whole trajectories.
+"""What is predicted and compared: short segments, whole trajectories, or their statistics.
 
 A mode cuts logs into segments and says what of them is to be explained, as an objective. Everything
 that comes after needs no more than residuals with a covariance.
@@ -6,25 +6,31 @@ that comes after needs no more than residuals with a covariance.
 
 from __future__ import annotations
 
-__all__ = ["MODES", "Mode", "Trajectories", "shortest"]
+__all__ = ["MODES", "Mode", "Summaries", "Trajectories", "shortest"]
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..effects.action import ActionDelay
+from ..effects.sensors import SensorDelay
 from ..inference.priors import Prior
 from ..logs.log import Log
 from .horizon import chosen_horizon
+from .noise import assumed_noise, measured_noise
 from .objective import Objective, Unit, origin, parameters_at
 from .prediction import Predictor
 from .segments import Segments, cut, cut_for_fits
+from .synthetic_likelihood import synthetic_objective
 from .whitening import whitening
 
 Array = NDArray[np.float64]
 _SHORTEST = 24  # control steps of a trajectory
 _PROBE = 12  # trajectories on which it is seen whether they are too long
 _CURVED = 1.0  # ratio of second to first differences, from which on chaos rules
+_WINDOW = 200  # control steps of which statistics are taken, at most
+_APART = 0.1  # s that clocks may be apart
 _COMPARED = 240  # numbers of a trajectory
 
 
@@ -33,9 +39,29 @@ class Mode:
 
     Attributes:
         name: As users call it.
+        synchronised: Whether commands and measurements of a row belong together.
+        untestable: Names of effects that it cannot tell from nothing.
+        alarms: What the reader must know.
     """
 
     name = "segments"
+    synchronised = True
+    untestable: tuple[str, ...] = ()
+    alarms: tuple[str, ...] = ()
+
+    def noise(
+        self, predictor: Predictor, logs: Sequence[Log], *, history: int, alarms: list[str]
+    ) -> tuple[Array, str]:
+        """Return the standard deviation of each channel's noise, and where it comes from.
+
+        Args:
+            predictor: Simulates.
+            logs: For training.
+            history: Rows before a segment that effects look back at.
+            alarms: To which is added what the reader must know.
+        """
+        system = predictor.system
+        return measured_noise(system, predictor, logs, history=history, alarms=alarms)
 
     def horizon(
         self,
@@ -125,9 +151,67 @@ class Trajectories(Mode):
         return cut(long, horizon, history=history, most=most, checks=checks)
 
 
+class Summaries(Mode):
+    """Statistics of windows, where clocks were not synchronised, or chaos decides.
+
+    See `synthetic_likelihood`. How late the one clock is cannot be told from a delay.
+    """
+
+    name = "summaries"
+    synchronised = False
+    untestable = ActionDelay.name, SensorDelay.name
+    alarms = (
+        "compared by statistics of windows, whatever the clocks' difference: delays are not "
+        "looked for",
+    )
+
+    def noise(
+        self,
+        predictor: Predictor,
+        logs: Sequence[Log],
+        *,
+        history: int,  # noqa: ARG002
+        alarms: list[str],  # noqa: ARG002
+    ) -> tuple[Array, str]:
+        """Return what is known without predictions."""
+        noise = assumed_noise(predictor.system, predictor, logs)
+        return noise, "the sensors' specification, or else third differences"
+
+    def horizon(
+        self,
+        predictor: Predictor,  # noqa: ARG002 (nothing is simulated)
+        parts: Mapping[str, Sequence[Log]],
+        *,
+        units: Sequence[Unit],  # noqa: ARG002 (long enough for all)
+        noise: Array,  # noqa: ARG002
+        history: int,
+    ) -> int:
+        """Return the length of a window: two fit into the shortest log."""
+        return max(_SHORTEST, min(_WINDOW, (shortest(parts) - 1 - history) // 2))
+
+    def cut(self, logs: Sequence[Log], horizon: int, *, history: int, most: int) -> Segments:
+        """Return at most so many windows."""
+        return cut(logs, horizon, history=history, most=most, burn_in=history)
+
+    def objective(
+        self,
+        predictor: Predictor,
+        prior: Prior | None,
+        segments: Segments,
+        *,
+        z: Array,
+        noise: Array,
+        generator: np.random.Generator | None = None,  # noqa: ARG002 (draws of its own)
+    ) -> Objective:
+        """Return what is to be made small."""
+        rows = round(_APART / predictor.system.control_dt)
+        shift = min(rows, segments.history, segments.horizon // 8)
+        return synthetic_objective(predictor, prior, segments, z=z, noise=noise, shift=shift)
+
+
 def shortest(parts: Mapping[str, Sequence[Log]]) -> int:
     """Return the length of the longest log in the split where that is shortest."""
     return min(max(len(log) for log in part) for part in parts.values())
 
 
-MODES: Mapping[str, type[Mode]] = {mode.name: mode for mode in (Mode, Trajectories)}
+MODES: Mapping[str, type[Mode]] = {mode.name: mode for mode in (Mode, Trajectories, Summaries)}

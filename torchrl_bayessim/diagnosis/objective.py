@@ -140,7 +140,12 @@ class Objective:
         prior: Over the parameters; none if there are none.
         segments: What to explain.
         whitening: Turns residuals into innovations.
+
+    Attributes:
+        located: Whether each residual belongs to a row of its segment.
     """
+
+    located = True
 
     def __init__(
         self, predictor: Predictor, prior: Prior | None, segments: Segments, whitening: Whitening

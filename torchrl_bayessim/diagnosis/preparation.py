@@ -20,7 +20,7 @@ from ..logs.log import Log
 from ..logs.system import System
 from .hidden import hidden_joints
 from .modes import Mode, shortest
-from .noise import assumed_noise, measured_noise
+from .noise import assumed_noise
 from .objective import Objective, Point, Unit, origin, parameters_at
 from .prediction import Predictor
 from .refit import Fit, refit
@@ -138,7 +138,7 @@ def prepare(
     if not logs:
         raise ValueError(message("logs", "none"))
     predictor = Predictor(system)
-    alarms: list[str] = []
+    alarms = list(mode.alarms)
     parts = split(logs)
     rows = shortest(parts)
     if rows <= max(_FEWEST, horizon or 0):
@@ -154,9 +154,7 @@ def prepare(
     some = cut(parts["train"], min(_STEPS, rows // 2), history=history, most=_FEW)
     noise = assumed_noise(system, predictor, parts["train"])
     predictor = with_fewest_steps(predictor, some, units, z=origin(system.prior), noise=noise)
-    noise, source = measured_noise(
-        system, predictor, parts["train"], history=history, alarms=alarms
-    )
+    noise, source = mode.noise(predictor, parts["train"], history=history, alarms=alarms)
     if horizon is None:
         horizon = mode.horizon(predictor, parts, units=units, noise=noise, history=history)
     pieces = {
