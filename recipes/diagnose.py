@@ -41,7 +41,7 @@ class Diagnosis(recipe.Settings):
     data: str = ""  # a folder of CSV or Parquet files, a Minari dataset, a saved TensorDict
     leave_out: str = ""  # logs whose names contain one of these, with commas between them
     effects: str = ""  # names with commas between them; the system's own by default
-    mode: str = "segments"  # or trajectories, or summaries where clocks are not synchronised
+    mode: str = ""  # segments, trajectories, or summaries where clocks are not synchronised
     horizon: int = 0  # control steps predicted at a time; 0: chosen from the data
     short: bool = False  # a smoke test: a diagnosis is one already
 
@@ -56,7 +56,7 @@ def job(settings: Diagnosis, out: Path) -> dict[str, Any]:
             logs,
             effects=chosen(settings.effects),
             findings=findings,
-            mode=settings.mode,
+            mode=settings.mode or None,
             horizon=settings.horizon or None,
             seed=settings.seed,
             progress=progress,

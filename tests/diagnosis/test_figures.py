@@ -10,7 +10,6 @@ from one_joint_arm import ARM, FRICTION
 
 from torchrl_bayessim.diagnosis.divergence import divergence_alarms
 from torchrl_bayessim.diagnosis.figures import figures
-from torchrl_bayessim.diagnosis.modes import Mode
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.preparation import prepare
 from torchrl_bayessim.diagnosis.selection import select
@@ -68,7 +67,7 @@ def searched():
     units = units_of([effect("coulomb_friction"), effect("action_bias")], system.robot)
     generator = np.random.default_rng(0)
     logs = [logged(seed) for seed in range(4)]
-    prepared = prepare(system, logs, units, generator=generator, mode=Mode(), horizon=20)
+    prepared = prepare(system, logs, units, generator=generator, horizon=20)
     train, judged = prepared.sets["train"], prepared.sets["validation"]
     return prepared, select(train, judged, prepared.nominal, units, generator=generator)
 

@@ -60,6 +60,7 @@ def test_a_simulator_that_is_right_needs_nothing_though_a_joint_was_not_logged()
     assert report.verdict == "none"
     assert report.gap.raw < 1.5
     assert "elbow was not logged" in report.alarms[0]
+    assert report.audit["mode"] == "trajectories"
 
 
 def test_friction_of_a_joint_that_was_not_logged_is_named():

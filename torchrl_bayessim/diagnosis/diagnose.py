@@ -43,7 +43,7 @@ def diagnose(
     *,
     effects: Sequence[str | Effect] | None = None,
     findings: Sequence[SanityFinding] = (),
-    mode: str = "segments",
+    mode: str | None = None,
     horizon: int | None = None,
     seed: int = 0,
     progress: Callable[[str], None] = lambda _: None,
@@ -57,9 +57,10 @@ def diagnose(
         logs: What the real robot did.
         effects: Names from the catalogue, or effects of your own; default the system's, or all.
         findings: Of the sanity gate, to be repeated in the report.
-        mode: What is predicted and compared: ``segments`` from measured states; ``trajectories``
-            from their first row on, where states cannot be set or hidden ones live long;
-            ``summaries``, statistics of windows, where clocks are not synchronised or chaos rules.
+        mode: What is predicted and compared: ``segments`` from measured states, the default;
+            ``trajectories`` from their first row on, where states cannot be set or hidden ones live
+            long, the default where a joint that matters was not logged; ``summaries``,
+            statistics of windows, where clocks are not synchronised or chaos rules.
         horizon: Control steps that are predicted at a time; default chosen from the data.
         seed: Of the bootstrap and of the null distribution's draws.
         progress: Told what is done.
@@ -70,13 +71,14 @@ def diagnose(
         KeyError: An effect is not in the catalogue.
     """
     begun = time.perf_counter()
-    if mode not in MODES:
+    if mode is not None and mode not in MODES:
         raise ValueError(message("a mode of the diagnosis", mode, available=list(MODES)))
     system = _system(simulator, prior)
     chosen = _effects(system, effects, logs)
     every = units_of(chosen, system.robot)
-    told = MODES[mode]()
-    units = [u for u in every if not u.effect.random and u.name not in told.untestable]
+    told = None if mode is None else MODES[mode]()
+    hopeless = () if told is None else told.untestable
+    units = [u for u in every if not u.effect.random and u.name not in hopeless]
     generator = np.random.default_rng(seed)
     # many small matrices: threads of their own cost more than they bring
     with threadpool_limits(1, user_api="blas"):

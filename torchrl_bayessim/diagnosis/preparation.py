@@ -19,7 +19,7 @@ from ..errors import message
 from ..logs.log import Log
 from ..logs.system import System
 from .hidden import hidden_joints
-from .modes import Mode, shortest
+from .modes import Mode, Trajectories, shortest
 from .noise import assumed_noise
 from .objective import Objective, Point, Unit, origin, parameters_at
 from .prediction import Predictor
@@ -118,7 +118,7 @@ def prepare(
     units: Sequence[Unit],
     *,
     generator: np.random.Generator,
-    mode: Mode,
+    mode: Mode | None = None,
     horizon: int | None = None,
 ) -> Prepared:
     """Split the logs, estimate the noise, choose the horizon, and fit the parameters.
@@ -128,7 +128,9 @@ def prepare(
         logs: Its logs.
         units: The effects that will be looked for; the horizon is chosen so that they show.
         generator: Of simulated noise, on which the whitening is checked.
-        mode: What is predicted and compared.
+        mode: What is predicted and compared; default segments, or trajectories where the motion of
+            a joint had to be estimated: where it began is then estimated once, and not with every
+            segment again, which a wrong model makes wrong.
         horizon: Control steps per segment; default chosen.
 
     Raises:
@@ -138,7 +140,7 @@ def prepare(
     if not logs:
         raise ValueError(message("logs", "none"))
     predictor = Predictor(system)
-    alarms = list(mode.alarms)
+    alarms = list(() if mode is None else mode.alarms)
     parts = split(logs)
     rows = shortest(parts)
     if rows <= max(_FEWEST, horizon or 0):
@@ -151,6 +153,8 @@ def prepare(
         )
     history = min(max(8, round(_HISTORY / system.control_dt)), 100)
     parts = _completed(predictor, system, parts, history=history, alarms=alarms)
+    estimated = parts["train"][0].uncertainty is not None
+    mode = mode or (Trajectories() if estimated else Mode())
     some = cut(parts["train"], min(_STEPS, rows // 2), history=history, most=_FEW)
     noise = assumed_noise(system, predictor, parts["train"])
     predictor = with_fewest_steps(predictor, some, units, z=origin(system.prior), noise=noise)
