@@ -11,7 +11,8 @@ opened, checked against the sum, and the reports are scored, once.
 
 Tiers: T0 no cause; T1 a cause as the catalogue has it; T2 the same cause in another form; T3 one
 whose class is withheld from the catalogue; T4 a cause that no catalogue has; T5 two causes; T6 the
-robot in another engine (MuJoCo with another integrator, cone and solver); controls: parameters at
+robot in another engine (MuJoCo with another integrator, cone and solver; T6B: the arm in PyBullet,
+which needs the extra ``pybullet``); controls: parameters at
 the edge of the prior, twice the noise of the data sheet, actions shuffled between trajectories,
 and the same case twice, the second time with every name drawn anew.
 ``baselines=true`` asks other methods too (see ``baselines/methods.py``), on the same folders.
@@ -49,7 +50,7 @@ from torchrl_bayessim.whole_file import replacing, write_text
 
 DIAGNOSIS = "diagnosis"
 RENAMED = "-renamed"  # after the name of a case that is handed over twice
-TIERS = ("T0", "T1", "T2", "T3", "T4", "T5", "T6", "controls")
+TIERS = ("T0", "T1", "T2", "T3", "T4", "T5", "T6", "T6B", "controls")
 # Robots, and cases by tier and robot. What the issue of a release asks for takes longer than two
 # hours: robots=arm,two_links tiers=T0=150,T1=290,T2=290,T3=150,T4=40,T5=30,T6=20,controls=10
 SHORT = "arm", {"T0": 1, "T1": 1, "T2": 2, "T3": 1, "T4": 1}
@@ -214,7 +215,7 @@ def reports_of(out: Path, name: str, *, baselines: bool) -> dict[str, dict[str, 
 def ask_oracle(case: Path, label: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the oracle names, where one cause is true and nothing is left to chance."""
     true = [truth["name"] for truth in label["truths"]]
-    if label["tier"] not in {"T1", "T2", "T6"} or len(true) != 1 or effect(true[0]).random:
+    if label["tier"] not in {"T1", "T2", "T6", "T6B"} or len(true) != 1 or effect(true[0]).random:
         return {}
     system = System.load(case / "system.yaml")
     said = named_by_oracle(system, read_logs(case, system), label)

@@ -21,7 +21,7 @@ GENERATOR = {
         "causes_body",
         "causes_foreign",
         "causes_sensing",
-        "causes_chance",
+        *("causes_chance", "plant_bullet"),
         "folders",
         "renaming",
     ),
@@ -50,7 +50,17 @@ def test_the_generator_imports_nothing_of_the_package():
             else:
                 assert module.split(".")[0] in {
                     *("__future__", "collections", "dataclasses", "hashlib", "io", "math"),
-                    *("pathlib", "re", "typing", "gymnasium", "mujoco", "numpy", "yaml"),
+                    *(
+                        "pathlib",
+                        "re",
+                        "tempfile",
+                        "typing",
+                        "gymnasium",
+                        "mujoco",
+                        "numpy",
+                        "yaml",
+                    ),
+                    "pybullet_utils",
                 }, f"{name} imports {module}"
 
 
@@ -290,6 +300,50 @@ def test_every_cause_changes_the_motion_and_is_called_what_it_is():
             cause, truth = CAUSES[name](site(form))
             assert (truth.name, truth.form) == (name, form)
             assert np.abs(run(cause, commands=wave, v=9.0).clean - plain).max() > 1e-5, (name, form)
+
+
+def test_the_arm_moves_alike_in_another_engine():
+    pytest.importorskip("pybullet_utils")
+    from withheld.causes_body import armature, coulomb
+    from withheld.plant_bullet import BulletPlant
+
+    wave = 2.0 * np.sin(np.arange(60) / 9)
+    start = np.array([0.3]), np.array([0.5]), lambda k, _: wave[k : k + 1]
+    for make in (None, coulomb, armature):
+        causes = [] if make is None else [make(site())[0]]
+        expected = plant(*causes).run(*start, steps=60).clean
+        errors = []
+        for timestep in (0.000625, 0.00015625):
+            model = plant(timestep=timestep).model
+            robot = BulletPlant(model, 0.02, causes, np.zeros(2), np.random.default_rng(0))
+            errors.append(np.abs(robot.run(*start, steps=60).clean - expected).max(0))
+        assert np.abs(expected).max() > 0.3
+        assert (errors[0] < [4e-3, 4e-2]).all(), make
+        assert (errors[1] < [1e-3, 1e-2]).all(), make  # of first order: a quarter
+
+
+def test_another_engine_is_asked_for_what_it_can_do(monkeypatch):
+    from withheld.cases import make
+    from withheld.plans import plans
+
+    drawn = plans({"T6B": 80}, ["arm", "two_links"], np.random.default_rng(0))
+    assert len(drawn) == 80
+    assert {(plan.robot, plan.engine) for plan in drawn} == {("arm", "bullet")}
+    causes = {name for plan in drawn for name in plan.causes}
+    assert "load_dependent_friction" not in causes
+    assert len(causes) > 20
+    for module in ("pybullet_utils", "pybullet_utils.bullet_client"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ImportError, match="expected PyBullet for tier T6B, got none; try pip"):
+        make(drawn[0], np.random.default_rng(0))
+
+
+def test_what_another_engine_cannot_describe_is_refused():
+    from withheld.plant_bullet import urdf
+    from withheld.robots import ROBOTS, nominal_model
+
+    with pytest.raises(ValueError, match="expected one hinge about the second axis, got 2 joints"):
+        urdf(nominal_model(ROBOTS["two_links"]))
 
 
 def test_detectability_is_nothing_without_a_cause_and_grows_with_it():

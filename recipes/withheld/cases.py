@@ -21,6 +21,7 @@ from .detectability import detectability
 from .excitation import KINDS, open_loop, proportional
 from .laws import Made, Site
 from .plant import Motion, Plant, Policy, Truth
+from .plant_bullet import BulletPlant
 from .robots import ROBOTS, Robot, nominal_model, write_entry
 
 Array = NDArray[np.float64]
@@ -36,11 +37,11 @@ class Plan:
     """What kind of case to draw.
 
     Attributes:
-        tier: ``T0`` to ``T6`` or a control's name.
+        tier: ``T0`` to ``T6``, ``T6B`` or a control's name.
         robot: Its name.
         causes: Names of the causes.
         form: ``same`` as the catalogue's, or ``other``.
-        engine: ``fine`` or ``other``: another integrator, cone and solver.
+        engine: ``fine``; ``other``: another integrator, cone and solver; or ``bullet``: PyBullet.
         control: ``parameters`` at the edge of the prior, ``noise`` twice that of the data sheet,
             actions ``shuffled`` between trajectories, handed over once more with all names
             ``renamed``, or nothing.
@@ -110,7 +111,8 @@ def _make(plan: Plan, rng: np.random.Generator) -> Case:
     made = [_cause(name, plan.form, model=nominal, robot=robot, rng=rng) for name in order]
     nv = nominal.nv
     noise = np.repeat([_log(rng, 1e-3, 3e-3), _log(rng, 1e-2, 3e-2)], nv)
-    plant = Plant(
+    kind = BulletPlant if plan.engine == "bullet" else Plant
+    plant = kind(
         _true_model(nominal, robot, plan.engine), robot.control_dt, [c for c, _ in made], noise, rng
     )
     loops = str(rng.choice(["open", "open", "closed", "mixed"]))
@@ -167,8 +169,8 @@ def _true_model(nominal: mujoco.MjModel, robot: Robot, engine: str) -> mujoco.Mj
         model.body_mass[body] = nominal.body_mass[body]
         model.body_inertia[body] = nominal.body_inertia[body]
     model.dof_damping[:] = nominal.dof_damping
-    if engine == "fine":
-        model.opt.timestep /= robot.refinement
+    if engine in {"fine", "bullet"}:  # Bullet's integrator is of first order
+        model.opt.timestep /= robot.refinement * (2 if engine == "bullet" else 1)
     else:
         model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC

@@ -16,8 +16,9 @@ from .scoring import NAMING, Record, scores, share
 
 HEADLINES = {
     "T0": "false_alarm", "T1": "top1_class", "T2": "top1_class", "T3": "wrong_named",
-    "T4": "wrong_named", "T5": "exact", "T6": "top1_class", "parameters": "false_alarm",
-    "noise": "false_alarm", "shuffled": "wrong_named", "renamed": "same",
+    "T4": "wrong_named", "T5": "exact", "T6": "top1_class", "T6B": "top1_class",
+    "parameters": "false_alarm", "noise": "false_alarm", "shuffled": "wrong_named",
+    "renamed": "same",
 }  # fmt: skip
 """The score by which methods are compared, of every tier."""
 

@@ -91,7 +91,9 @@ def failed(one: Record) -> bool:
         return True
     if one["tier"] == "renamed":
         return not one.get("same", True)
-    if one["tier"] in {"T3", "T4", "shuffled"} or (one["tier"] == "T6" and not one["truth"]):
+    if one["tier"] in {"T3", "T4", "shuffled"} or (
+        one["tier"] in {"T6", "T6B"} and not one["truth"]
+    ):
         return one["verdict"] == "named"
     if not one["truth"]:
         return one["verdict"] not in {"none", "not_testable"}

@@ -17,6 +17,8 @@ from .causes_sensing import SENSING
 from .classes import class_of
 
 CONTROLS = ("parameters", "noise", "shuffled", "renamed")
+_ENGINES = {"T6": "other", "T6B": "bullet"}
+_OF_MUJOCO = {"load_dependent_friction"}  # which asks MuJoCo for the load
 _OF_GYMNASIUM = {"hopper", "half_cheetah"}
 _OTHER_ONLY = {"backlash", "series_elasticity"}  # of two masses, unlike the catalogue's
 _SAME_ONLY = {"armature", "com_shift"}
@@ -37,7 +39,8 @@ def plans(tiers: Mapping[str, int], robots: Sequence[str], rng: np.random.Genera
     """Return plans in random order.
 
     Args:
-        tiers: Number of cases by tier and robot, ``T0`` to ``T6`` and ``controls`` (of each).
+        tiers: Number of cases by tier and robot, ``T0`` to ``T6``, ``T6B`` (of the arm only) and
+            ``controls`` (of each).
         robots: Their names.
         rng: Of causes and order; causes are dealt from shuffled decks, so that all occur alike.
     """
@@ -60,9 +63,11 @@ def _tier(tier: str, robot: str, count: int, rng: np.random.Generator) -> list[P
                         for n in _deal(same, count, rng)]  # fmt: skip
     if tier == "T5":
         return [_pair(robot, rng) for _ in range(count)]
-    if tier == "T6":
-        half = [()] * (count - count // 2) + [(name,) for name in _deal(same, count // 2, rng)]
-        return [Plan(tier, robot, causes, engine="other") for causes in half]
+    if tier in _ENGINES:
+        deck = [name for name in same if tier == "T6" or name not in _OF_MUJOCO]
+        half = [()] * (count - count // 2) + [(name,) for name in _deal(deck, count // 2, rng)]
+        able = tier == "T6" or robot == "arm"
+        return [Plan(tier, robot, causes, engine=_ENGINES[tier]) for causes in half if able]
     deck = {"T1": same, "T2": other, "T3": same, "T4": list(FOREIGN)}[tier]
     form = "other" if tier == "T2" else "same"
     return [Plan(tier, robot, (name,), form) for name in _deal(deck, count, rng)]

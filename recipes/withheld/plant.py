@@ -122,12 +122,10 @@ class Plant:
         Raises:
             FloatingPointError: The simulation diverged.
         """
-        mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[:], self.data.qvel[:] = q, v
         self.commands, self.states, self.acts = [], [], []
         for cause in self.causes:
             cause.memory.clear()
-        mujoco.mj_forward(self.model, self.data)
+        self._reset(q, v)
         clean, measured = [], []
         for k in range(steps):
             self.acts.append(np.zeros(len(self.causes)))
@@ -141,6 +139,17 @@ class Plant:
             raise FloatingPointError("the simulation diverged")
         acts = np.array(self.acts).reshape(steps, len(self.causes))
         return Motion(rows, np.array(measured), rows[:, :nv], np.array(self.commands), acts)
+
+    def _reset(self, q: Array, v: Array) -> None:
+        """Put the robot into a state, at time zero."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:], self.data.qvel[:] = q, v
+        mujoco.mj_forward(self.model, self.data)
+
+    def _advance(self, u: Array, force: Array) -> None:
+        """Go on by a time step, with the commands that arrive and generalised forces."""
+        self.data.ctrl[:], self.data.qfrc_applied[:] = u, force
+        mujoco.mj_step(self.model, self.data)
 
     def _read(self) -> Array:
         y = np.concatenate([self.q, self.v])
@@ -157,13 +166,12 @@ class Plant:
             arrives = cause.command(u, self)
             self._acted(i, arrives - u)
             u = arrives
-        self.data.ctrl[:] = u
-        self.data.qfrc_applied[:] = 0.0
+        total = np.zeros(self.model.nv)
         for i, cause in enumerate(self.causes):
             force = cause.force(self)
             self._acted(i, force)
-            self.data.qfrc_applied += force
-        mujoco.mj_step(self.model, self.data)
+            total += force
+        self._advance(u, total)
 
     def _acted(self, cause: int, change: Array | float) -> None:
         """Note how much a cause changed."""

@@ -219,7 +219,7 @@ def _tier(tier: str, every: Sequence[Record], visible: Sequence[Record]) -> dict
         "named_right": share(r["top1_class"] for r in single if r["verdict"] == "named"),
         "silent": share(not alarm(r) for r in single),
     }
-    if tier == "T6":
+    if tier in {"T6", "T6B"}:
         none = [r for r in mine if not r["truth"]]
         # another integrator or contact model is a gap that may be seen; it has no name
         result["none_wrong_named"] = share(r["verdict"] == "named" for r in none)
