@@ -127,8 +127,10 @@ def leave(made: list[Path]) -> None:
         if all(file == path for file in written):
             path.unlink()
     for path in made:
-        with suppress(OSError):
-            path.rmdir()
+        folders = [inner for inner in path.rglob("*") if inner.is_dir()]
+        for folder in [*sorted(folders, reverse=True), path]:  # innermost first; the empty ones
+            with suppress(OSError):
+                folder.rmdir()
 
 
 def debugging(arguments: list[str]) -> bool:

@@ -40,9 +40,9 @@ keep("result.json", {**state, "provenance": {"seconds": time.perf_counter() - st
 def modules(monkeypatch):
     monkeypatch.syspath_prepend(BENCHMARKS)
     import killed
-    import outputs
+    import written_numbers
 
-    return killed, outputs
+    return killed, written_numbers
 
 
 @pytest.mark.parametrize("broken", [False, True])
@@ -79,27 +79,27 @@ def write(folder, *, weight=1.0, seconds=1.0, nan=float("nan")):
 
 
 def test_the_last_bit_counts_and_times_and_paths_do_not(modules, tmp_path):
-    _, outputs = modules
+    _, written_numbers = modules
     write(tmp_path / "one")
     write(tmp_path / "same", seconds=2.0)
     write(tmp_path / "other", weight=float(np.nextafter(np.float32(1), np.float32(2))))
-    one, same, other = (outputs.read(tmp_path / name) for name in ("one", "same", "other"))
-    assert outputs.differing(one, same) == []
-    assert outputs.differing(one, other) == ["policy.pt/weight", "result.json/real/0"]
-    assert outputs.differing(one, one | {"more.json": 0}) == ["more.json"]
-    assert outputs.apart(one, same) == {}
-    assert outputs.apart(one, other) == {"real": pytest.approx(2**-23, rel=0.05)}
-    assert outputs.apart(one, {}) == {"real": np.inf}
+    one, same, other = (written_numbers.read(tmp_path / name) for name in ("one", "same", "other"))
+    assert written_numbers.differing(one, same) == []
+    assert written_numbers.differing(one, other) == ["policy.pt/weight", "result.json/real/0"]
+    assert written_numbers.differing(one, one | {"more.json": 0}) == ["more.json"]
+    assert written_numbers.apart(one, same) == {}
+    assert written_numbers.apart(one, other) == {"real": pytest.approx(2**-23, rel=0.05)}
+    assert written_numbers.apart(one, {}) == {"real": np.inf}
 
 
 @pytest.mark.parametrize("name", ["policy.pt", "result.json"])
 def test_a_file_that_is_not_whole_is_found(modules, tmp_path, name):
-    _, outputs = modules
+    _, written_numbers = modules
     write(tmp_path)
     file = tmp_path / name
     file.write_bytes(file.read_bytes()[:-7])
     with pytest.raises(ValueError, match=r"whole checkpoint|Expecting"):
-        outputs.read(tmp_path)
+        written_numbers.read(tmp_path)
     left = tmp_path / ".result.json.12.tmp"
     left.write_text("")
-    assert outputs.unfinished(tmp_path) == [left]
+    assert written_numbers.unfinished(tmp_path) == [left]

@@ -356,6 +356,18 @@ def test_more_than_ten_rounds():
     assert len({turn.posterior.mean.item() for turn in turns}) == 12
 
 
+def test_more_than_ten_rounds_go_on_where_they_were_left(tmp_path):
+    options = {"rounds": 13, "updates": 1, "horizon": 4, "simulations": 12}
+    whole = [numbers(turn) for turn in make_loop(**options)]
+    file = tmp_path / "loop.pt"
+    for turn in make_loop(**options, checkpoint_file=file):
+        if turn.index == 11:
+            break
+    resumed = make_loop(**options, checkpoint_file=file)
+    assert resumed.resume()
+    assert_same([numbers(turn) for turn in resumed], whole[11:])
+
+
 # Real data: what a robot may bring.
 
 
@@ -370,6 +382,13 @@ class Bringing:
 
     def rollouts(self, policy, **options):
         return self.change(self.robot.rollouts(policy, **options))
+
+
+@pytest.mark.parametrize("entry", ["observation", "action"])
+def test_measurements_of_another_size_are_refused_before_simulating(entry):
+    robot = Bringing(lambda real: real.set(entry, torch.cat([real[entry]] * 2, -1)))
+    with pytest.raises(ValueError, match=rf"columns of '{entry}', as the simulator has.*the robot"):
+        list(make_loop(robot=robot))
 
 
 def test_a_robot_that_did_fewer_episodes_is_compared_with_as_many():

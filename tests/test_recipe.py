@@ -96,7 +96,7 @@ def test_pictures_curves_and_checkpoint_are_there(finished):
 def test_killed_in_mid_run_it_resumes_to_the_same_files(finished, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(RECIPE.parent / "benchmarks")
     from killed import Case, run
-    from outputs import differing, read
+    from written_numbers import differing, read
 
     folder, _ = finished
     case, broken = Case(RECIPE, TINY), tmp_path / "run"
@@ -169,7 +169,7 @@ def test_bad_settings_are_explained(arguments, said, refused, tmp_path):
 def test_refused_input_leaves_no_run_behind(refused, tmp_path):
     for wrong in ("task=cartpol", "rounds=0"):  # refused by the recipe, and by the loop
         assert "expected" in refused(wrong, "out=run")
-        assert not (tmp_path / "run" / "settings.json").exists()
+        assert not (tmp_path / "run").exists()
 
 
 def test_a_folder_that_holds_a_run_is_not_taken_for_another(finished, refused):

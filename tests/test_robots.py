@@ -16,6 +16,7 @@ from torchrl.envs import (
 from torchrl_bayessim.agents.ppo import PPO
 from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+from torchrl_bayessim.errors import SimulationError
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.physics.attributes import AttributePhysics
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
@@ -195,6 +196,30 @@ def test_robots_and_logs_tell_themselves_from_others():
     first, again, longer = (RecordedLogs(rows).settings for rows in logs)
     assert (first == again) == torch.equal(logs[0]["action"], logs[1]["action"])
     assert first == RecordedLogs(logs[0].clone()).settings != longer
+
+
+class Diverging(CartPoleEnv):
+    """A cart-pole whose observations are lost after three steps."""
+
+    def _step(self, tensordict):
+        out = super()._step(tensordict)
+        self.count = getattr(self, "count", 0) + 1
+        return out.set("observation", out["observation"] / float(self.count <= 3))
+
+
+def test_a_robot_that_diverges_is_named():
+    env = TransformedEnv(Diverging(2), ApplyPhysics(AttributePhysics("length")))
+    robot = SurrogateRobot(env, [0.5], max_steps=9)
+    policy = PPO(batched(), hidden=(4,)).policy
+    with pytest.raises(SimulationError, match=r"finite values of .*in episode 0 at step .*diverge"):
+        robot.rollouts(policy, episodes=2, key=(0,))
+
+
+def test_what_is_no_parameter_and_no_list_of_entries_is_refused():
+    with pytest.raises(TypeError, match=r"numbers, the parameters θ of shape \(D,\), got 'long'"):
+        SurrogateRobot(batched(), "long", max_steps=5)
+    with pytest.raises(TypeError, match=r"sequence of entries.*Try: measured=\('observation',\)"):
+        SurrogateRobot(batched(), [0.5], max_steps=5, measured="observation")
 
 
 @pytest.mark.parametrize("steps", [0, -1])

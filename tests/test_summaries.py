@@ -561,3 +561,16 @@ def test_statistics_depend_on_the_policy_so_that_pairs_of_two_must_not_be_mixed(
     assert distance(robot, again) < 4
     assert distance(robot, other_physics) > 20
     assert distance(robot, other_policy) > 20
+
+
+@every_summary
+def test_encoder_counts_are_numbers_like_others(summary):
+    counts = torch.randint(-50, 50, (3, 21, 2), generator=generator(0))
+    action = torch.randn(3, 20, 1, generator=generator(1))
+    mask = torch.ones(3, 20, dtype=torch.bool)
+    found = []
+    for state in (counts, counts.float()):
+        steps = {"observation": state[:, :-1], "next": {"observation": state[:, 1:]}}
+        rows = TensorDict(steps | {"action": action, "mask": mask}, [3, 20])
+        found.append(SummaryStatistics(summary)(rows)["summary"])
+    torch.testing.assert_close(*found, rtol=0, atol=0)

@@ -228,6 +228,14 @@ def test_another_adapter_on_the_same_simulator_finds_the_nominal_values():
     assert again.unwrapped.masspole == 0.1
 
 
+@pytest.mark.parametrize("appended", [True, False])
+def test_a_second_randomizer_is_refused_and_not_ignored(appended):
+    env, pinned = with_randomizer(DomainRandomizer(Uniform())), DomainRandomizer(Uniform())
+    pinned.pin([0.4, 0.9])
+    with pytest.raises(PhysicsError, match=r"one DomainRandomizer of 'theta', got 'two'.*pin it"):
+        env.append_transform(pinned) if appended else TransformedEnv(env, pinned, auto_unwrap=True)
+
+
 def test_clones_count_their_own_episodes():
     randomizer = DomainRandomizer(Uniform())
     env, other = with_randomizer(randomizer), with_randomizer(randomizer.clone())

@@ -250,6 +250,7 @@ class SimToRealLoop:
         state, policy = self._state, self.learner.policy
         key = (self.seed, "round", state["round"])
         real = self.robot.rollouts(policy, episodes=self.episodes, key=key)
+        self._check_sizes(real)
         if not self.robot.recorded:
             real = comparable(real, horizon=self.horizon)
         evidence: list[Evidence] = [] if self.robot.recorded else state["evidence"]
@@ -260,6 +261,18 @@ class SimToRealLoop:
         }
         kept = real.select(*self.statistics.in_keys, "mask", ("next", "reward"), strict=False)
         state |= {"evidence": [*evidence, new], "real": _flatten(kept)}
+
+    def _check_sizes(self, real: TensorDictBase) -> None:
+        """Refuse measurements and actions that are not those of the simulator."""
+        env = self._simulator.env
+        for key, known in (
+            (self.statistics.observation_key, env.full_observation_spec),
+            (self.statistics.action_key, env.full_action_spec),
+        ):
+            spec, value = known.get(key, None), real.get(key, None)
+            if spec is not None and value is not None and spec.shape[-1:] != value.shape[-1:]:
+                expected = f"{spec.shape[-1]} columns of {key!r}, as the simulator has"
+                raise ValueError(message(expected, f"{value.shape[-1]} from the robot"))
 
     def _infer(self) -> None:
         state, key = self._state, (self.seed, "round", self._state["round"])

@@ -20,7 +20,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from .errors import message
+from .diverged import UndisturbedPolicy
+from .errors import SimulationError, message
 from .randomness import isolated, seed_from
 from .sources import Grid
 from .trajectories import concatenate, first_trajectories
@@ -59,6 +60,8 @@ class SurrogateRobot:
             other, and nothing else is reported.
 
     Raises:
+        SimulationError: In a call: what was measured is not finite.
+        TypeError: θ is not made of numbers, or ``measured`` is one name and no sequence.
         ValueError: For a measured entry that is not observed, no steps, or an environment that
             draws its own parameters; in a call, for no episodes, or a policy that reads what is not
             measured.
@@ -87,8 +90,14 @@ class SurrogateRobot:
         if max_steps < 1:
             raise ValueError(message("max_steps to be positive", max_steps))
         _check_not_randomized(env)
+        if isinstance(measured, str):
+            hint = f"measured=({measured!r},)"
+            raise TypeError(message("a sequence of entries to measure", measured, hint=hint))
         self.max_steps, self.measured = max_steps, list(measured)
-        theta = torch.as_tensor(theta, dtype=torch.float32)
+        try:
+            theta = torch.as_tensor(theta, dtype=torch.float32)
+        except (TypeError, ValueError):
+            raise TypeError(message("numbers, the parameters θ of shape (D,)", theta)) from None
         self._theta = theta
         self._randomizer = DomainRandomizer(Grid(theta[None]))
         self._env = TransformedEnv(env, self._randomizer, auto_unwrap=False)
@@ -124,6 +133,8 @@ class SurrogateRobot:
                 raise ValueError(
                     message("a policy that reads what is measured", entry, available=self.measured)
                 )
+        if isinstance(policy, TensorDictModuleBase):
+            policy = UndisturbedPolicy(policy)
         width = max(1, self._env.batch_size.numel())
         rows: list[TensorDictBase] = []
         for index in range(-(-episodes // width)):
@@ -135,9 +146,22 @@ class SurrogateRobot:
                 )
             rows.append(batch.reshape(-1, batch.shape[-1]))
         real = first_trajectories(concatenate(rows)[:episodes])
+        self._check_finite(real)
         following = [*self.measured, "reward", "done", "terminated", "truncated"]
         reported = [*self.measured, "action", "mask", *(_next(entry) for entry in following)]
         return real.select(*reported, strict=False)
+
+    def _check_finite(self, real: TensorDictBase) -> None:
+        mask: Tensor = real.get("mask")
+        for entry in (*self.measured, *(_next(entry) for entry in self.measured)):
+            value = real.get(entry)
+            good = value.isfinite().reshape(*mask.shape, -1).all(-1) | ~mask
+            if not good.all():
+                row, step = (~good).nonzero()[0].tolist()
+                expected = f"a robot that measures finite values of {entry!r}"
+                got = f"NaN or infinity in episode {row} at step {step}"
+                hint = "does its simulation diverge at these parameters? Let it end the episode"
+                raise SimulationError(message(expected, got, hint=hint))
 
 
 def _check_not_randomized(env: EnvBase) -> None:

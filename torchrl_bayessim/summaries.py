@@ -175,6 +175,7 @@ def linear_dynamics(state: Tensor, action: Tensor, next_state: Tensor, mask: Ten
         >>> linear_dynamics(s[:, :-1], a, s[:, 1:], mask)[0, :2].round(decimals=3)
         tensor([-0.1000,  1.0000])
     """
+    state, next_state = _float(state), _float(next_state)
     count = mask.sum(-1).clamp_min(1)[..., None, None]
 
     def centred(values: Tensor) -> tuple[Tensor, Tensor]:
@@ -298,8 +299,8 @@ class SummaryStatistics(TensorDictModuleBase):
     ) -> dict[int, Tensor]:
         """Return the values of all functions, or of those that are ``ordered`` or not."""
         _check_entries(tensordict, self.in_keys[:3])
-        state, mask = tensordict.get(self.observation_key), tensordict.get("mask")
-        following = tensordict.get(_next(self.observation_key))
+        state, mask = _float(tensordict.get(self.observation_key)), tensordict.get("mask")
+        following = _float(tensordict.get(_next(self.observation_key)))
         if any(not -state.shape[-1] <= column < state.shape[-1] for column in self.angles):
             columns = f"angles among the {state.shape[-1]} columns of {self.observation_key!r}"
             raise ValueError(message(columns, self.angles))
@@ -362,6 +363,11 @@ def _check_entries(trajectories: TensorDictBase, keys: Sequence[NestedKey]) -> N
     if not trajectories.batch_size.numel():
         got = f"batch size {tuple(trajectories.batch_size)}"
         raise ValueError(message("trajectories of at least one step", got))
+
+
+def _float(values: Tensor) -> Tensor:
+    """Return encoder counts and other integers as floats, which differences and means are."""
+    return values if values.is_floating_point() else values.to(torch.get_default_dtype())
 
 
 def _is_ordered(function: Summary) -> bool:

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 from measuring import options, report
-from outputs import differing, read, unfinished
+from written_numbers import differing, read, unfinished
 
 RECIPES = Path(__file__).parent.parent
 

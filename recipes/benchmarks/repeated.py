@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from killed import RECIPES, Case, run
 from measuring import options, report
-from outputs import apart, differing, read
+from written_numbers import apart, differing, read
 
 SETTINGS = {
     "sim2real_ppo": ("short=true",),

@@ -52,6 +52,14 @@ def midpoints(low, high, points):
     return low + (axis[1:] + axis[:-1]) / 2 * (high - low), (high - low) / points
 
 
+def test_weights_of_other_summaries_are_refused():
+    prior = BoxPrior({"mass": (2.0, 6.0)})
+    state = MixtureDensityPosterior(prior, 3).state_dict()
+    MixtureDensityPosterior(prior, 3).load_state_dict(state)
+    with pytest.raises(ValueError, match="fitted with compress=False, got 'compress=True'"):
+        MixtureDensityPosterior(prior, 3, compress=False).load_state_dict(state)
+
+
 @pytest.mark.parametrize("name", ONE)
 def test_densities_in_original_units_integrate_to_one(name):
     prior = ONE[name]

@@ -24,6 +24,13 @@ def gaussian():
 PRIORS = pytest.mark.parametrize("prior", [box(), gaussian()], ids=["box", "gaussian"])
 
 
+@pytest.mark.parametrize("high", [1.0001, 1.5, 20.0])
+def test_the_variance_of_a_log_uniform_is_that_of_its_draws(high):
+    prior = BoxPrior({"d": (1.0, high)}, log=["d"])
+    draws = prior.sample((200_000,), generator=torch.Generator().manual_seed(0)).double()
+    torch.testing.assert_close(prior.variance.double(), draws.var(0), rtol=0.02, atol=0.0)
+
+
 def test_draws_stay_in_the_box_with_one_range_per_column():
     theta = box().sample((4000,), generator=generator(0))
     low, high = torch.tensor([2.0, 0.01, -3.0]), torch.tensor([6.0, 1.0, -1.0])

@@ -70,6 +70,24 @@ def test_a_linear_gaussian_problem_has_its_known_posterior(correction):
     assert last.posterior.stddev.item() == pytest.approx(precision**-0.5, rel=0.12)
 
 
+@pytest.mark.parametrize("observed", [torch.tensor([[torch.nan]]), torch.zeros(1, 1, 1)])
+def test_what_was_observed_is_checked_before_simulating(observed):
+    def never(theta):
+        raise AssertionError
+
+    with pytest.raises(ValueError, match="finite summaries of the real trajectories"):
+        next(sequential(never, BOX, observed, rounds=1, simulations=100, **QUICK))
+
+
+@pytest.mark.filterwarnings("ignore:.*left out")
+def test_simulations_that_diverge_are_not_effective_pairs():
+    def half(theta):
+        return torch.where(theta > 0, theta, torch.nan)
+
+    turn = next(sequential(half, BOX, OBSERVED, rounds=1, simulations=200, **QUICK))
+    assert turn.effective_pairs == pytest.approx(100, abs=20)
+
+
 @pytest.mark.filterwarnings("ignore:.*quotient wider than the prior")
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_analytic_correction_stays_at_the_known_posterior_round_after_round(seed):

@@ -268,6 +268,7 @@ def write(env, physics, *values):
         ("body_inertia[ball,1]", -1e-9, "finite and not negative"),
         ("geom_size[g,0]", -0.1, "finite and not negative"),
         ("geom_friction[g,0]", -1.0, "finite and not negative"),
+        ("dof_frictionloss[x]", -1.0, "finite and not negative"),
         ("opt.timestep", 0.0, "finite and positive"),
         ("opt.gravity[2]", -np.inf, "finite"),
     ],

@@ -70,7 +70,8 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
 
     Raises:
         TypeError: The prior is none of :mod:`.priors`.
-        ValueError: An unknown feature map; when a state is loaded, one of another prior.
+        ValueError: An unknown feature map; when a state is loaded, one of another prior or another
+            ``compress``.
 
     Example:
         >>> from tensordict import TensorDict
@@ -129,6 +130,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         ]
         super().__init__(*modules)  # pyright: ignore[reportCallIssue, reportArgumentType]
         self.prior, self.summary_key, self.theta_key = prior, in_key, out_key
+        self.compress = compress
         self.seen: Tensor | None = None
         self.held_out: TensorDictBase | None = None
 
@@ -235,11 +237,12 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         return found
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return what identifies the prior, and the summaries that it was fitted to."""
-        return {"prior": dict(self.prior.settings), "seen": self.seen}
+        """Return what identifies the prior, what no weight shows, and the summaries of the fit."""
+        settings = dict(self.prior.settings)
+        return {"prior": settings, "compress": self.compress, "seen": self.seen}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Refuse weights that were fitted under another prior; take over the summaries."""
+        """Refuse weights that were fitted under another prior or other summaries."""
         fitted = dict(state["prior"])
         if fitted != self.prior.settings:
             raise ValueError(
@@ -249,6 +252,9 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
                     hint="a posterior over the prior that they were fitted under",
                 )
             )
+        if state.get("compress", self.compress) != self.compress:
+            expected = f"weights fitted with compress={self.compress}"
+            raise ValueError(message(expected, f"compress={state['compress']}"))
         self.seen = state["seen"]
 
     def extra_repr(self) -> str:

@@ -193,9 +193,10 @@ class BoxPrior(Prior):
     @property
     def variance(self) -> Tensor:
         """The prior variances, shape ``(D,)``."""
-        width = torch.where(self.log, (self.high / self.low).log(), 1.0)
-        square = (self.high**2 - self.low**2) / (2 * width)
-        return torch.where(self.log, square - self.mean**2, (self.high - self.low) ** 2 / 12)
+        low, high = self.low.double(), self.high.double()  # of narrow boxes little would be left
+        width = torch.where(self.log, (high / low).log(), 1.0)
+        square = (high**2 - low**2) / (2 * width) - ((high - low) / width) ** 2
+        return torch.where(self.log, square, (high - low) ** 2 / 12).to(self.low.dtype)
 
     def sample(
         self, sample_shape: Sequence[int] = (), *, generator: torch.Generator | None = None

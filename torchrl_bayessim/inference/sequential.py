@@ -46,7 +46,7 @@ class SequentialRound:
         index: From 0.
         posterior: Given the observed summaries.
         fit: What the fit did.
-        effective_pairs: Effective number of pairs after weighting.
+        effective_pairs: Effective number of pairs after weighting, of those that are finite.
         repaired: Components narrowed or dropped by the analytic correction.
         refused: Whether the analytic correction was refused; ``posterior`` is the last round's
             then, and its pairs are kept for the next.
@@ -96,8 +96,9 @@ def sequential(
         One :class:`SequentialRound` after another.
 
     Raises:
-        ValueError: On the first turn, for an unknown correction or counts that are too small, or a
-            simulator that does not give one summary per simulation.
+        ValueError: On the first turn, for an unknown correction, counts that are too small,
+            ``observed`` that is not finite, or a simulator that does not give one summary per
+            simulation.
 
     Warns if the real summaries lie apart from all simulated ones, or the posterior at an edge: see
     :mod:`.misspecification`.
@@ -109,6 +110,9 @@ def sequential(
         raise ValueError(
             message("a correction", correction, available=["importance", "truncated", "analytic"])
         )
+    if observed.ndim not in {1, 2} or not observed.isfinite().all():
+        expected = "finite summaries of the real trajectories, shape (n, L)"
+        raise ValueError(message(expected, observed.tolist()))
     proposal: Any = prior
     posterior: PhysicsPosterior | None = None
     history: list[tuple[Proposal, TensorDict]] = []
@@ -137,7 +141,7 @@ def sequential(
             posterior = learned
         for doubt in doubts(pairs["summary"], observed, posterior):
             warnings.warn(doubt, stacklevel=2)
-        effective = effective_sample_size(pairs["weight"])
+        effective = effective_sample_size(pairs["weight"][pairs["summary"].isfinite().all(-1)])
         yield SequentialRound(index, posterior, report, effective, repaired, refused)
         if not refused:
             proposal = _next_proposal(posterior, prior, correction, prior_share)

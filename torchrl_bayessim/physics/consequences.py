@@ -69,8 +69,9 @@ _FREE = (
     mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_BOX,
 )  # fmt: skip
 _NOT_NEGATIVE = {
-    "body_mass", "body_inertia", "dof_armature", "tendon_armature", "geom_size", "geom_friction",
-    "pair_friction", "opt.density", "opt.viscosity",
+    "body_mass", "body_inertia", "dof_armature", "dof_frictionloss", "tendon_armature",
+    "tendon_frictionloss", "geom_size", "geom_friction", "pair_friction", "opt.density",
+    "opt.viscosity",
 }  # fmt: skip
 _POSITIVE = {"opt.timestep", "opt.impratio"}
 

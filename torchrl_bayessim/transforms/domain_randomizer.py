@@ -43,8 +43,9 @@ class DomainRandomizer(Transform):
         pool: Restrict to this many draws, made once (the BayesSim paper's 100 domains).
 
     Raises:
-        PhysicsError: No `ApplyPhysics` before it writes ``key``, or for other parameters; at a
-            reset, workers of a batched environment that nothing tells apart.
+        PhysicsError: No `ApplyPhysics` before it writes ``key``, or for other parameters; another
+            randomizer of ``key``; at a reset, workers of a batched environment that nothing tells
+            apart.
         TypeError: The source, now or when assigned, cannot be sampled.
 
     Example:
@@ -181,12 +182,25 @@ class DomainRandomizer(Transform):
                     "or ApplyPhysics inside the function that makes each environment",
                 )
             )
+        self._check_alone()
         if self.names is not None and len(self.names) != spec.shape[-1]:
             raise PhysicsError(
                 message(f"{spec.shape[-1]} parameters, as ApplyPhysics has", self.names)
             )
         note_seeds(simulator(self.parent))
         self._check_names()
+
+    def _check_alone(self) -> None:
+        """Refuse a second randomizer of the same entry, of which one would be ignored."""
+        env = self.parent
+        while isinstance(env, TransformedEnv):
+            for module in env.transform.modules():
+                other = isinstance(module, DomainRandomizer) and module._shared is not self._shared
+                if other and module.key == self.key:
+                    expected = f"one DomainRandomizer of {self.key!r}"
+                    hint = "assign to the source of the one that is there, or pin it"
+                    raise PhysicsError(message(expected, "two", hint=hint))
+            env = env.base_env
 
     def _check_names(self) -> None:
         """Compare names with those beside the simulators, once the simulators exist."""
