@@ -161,8 +161,8 @@ class Summaries(Mode):
     synchronised = False
     untestable = ActionDelay.name, SensorDelay.name
     alarms = (
-        "compared by statistics of windows, whatever the clocks' difference: delays are not "
-        "looked for",
+        f"compared by statistics of windows, for clocks up to {_APART} s or an eighth of a window "
+        "apart: delays are not looked for",
     )
 
     def noise(
