@@ -97,6 +97,8 @@ def test_identification_without_effects_finds_the_parameters(tmp_path, plain):
     found = runs.sets["train"].theta(fitted_parameters(runs))
     np.testing.assert_allclose(found, list(plain.theta.values()), rtol=0.05)
     assert parameters_only(runs)["verdict"] == "none"
+    sag = next(unit.effect for unit in runs.units if unit.name == "battery_sag")
+    assert sag.seconds == pytest.approx(90 * 0.02)  # as the diagnosis counts it
 
 
 def test_columns_of_forces_are_what_the_simulator_does(tmp_path, plain):

@@ -57,7 +57,8 @@ def whole_runs(system: System, logs: Sequence[Log]) -> Runs:
     history = round(_HISTORY / system.control_dt)
     runs = {n: cut(part, steps, history=history, checks=_CHECKS) for n, part in parts.items()}
     names = list(CATALOGUE) if system.effects is None else system.effects
-    every = units_of([effect(name) for name in names], system.robot)
+    seconds = max(len(log) for log in logs) * system.control_dt
+    every = units_of([effect(name).forms(seconds)[0] for name in names], system.robot)
     units = tuple(unit for unit in every if not unit.effect.random)
     predictor = with_fewest_steps(
         Predictor(system, threads=1), runs["train"], units, z=origin(system.prior), noise=noise

@@ -58,7 +58,7 @@ def true_shrinkage(
     if not report.get("effects") or any(effect(e["name"]).random for e in report["effects"]):
         return None
     theta = np.array([_theta(report, kind) for kind in ("without_effects", "with_effects")])
-    strengths = [{}, _named(system, report)]
+    strengths = [{}, _named(system, report, logs)]
     horizon = report["gap"]["horizon_steps"]
     noise = np.array([report["audit"]["noise"][name] for name in system.robot.channels])
     seen = _logs(unseen, logs[0], system)
@@ -92,7 +92,7 @@ def gaps_removed(
         system,
         _logs(unseen, logs[0], system),
         np.array([prior, *(_theta(r, kinds[name]) for name, r in able.items())]),
-        [{}, *(_named(system, r) if naming[name] else {} for name, r in able.items())],
+        [{}, *(_named(system, r, logs) if naming[name] else {} for name, r in able.items())],
         horizon=first["gap"]["horizon_steps"],
         noise=np.array([first["audit"]["noise"][name] for name in system.robot.channels]),
     )
@@ -104,11 +104,15 @@ def _theta(report: Mapping[str, Any], kind: str) -> list[float]:
     return [parameter[kind] for parameter in report["parameters"]]
 
 
-def _named(system: System, report: Mapping[str, Any]) -> dict[Unit, float]:
-    """Return the strengths that a report names, at single targets; none of chance."""
+def _named(system: System, report: Mapping[str, Any], logs: Sequence[Log]) -> dict[Unit, float]:
+    """Return the strengths that a report names, at single targets; none of chance.
+
+    Of an effect's forms the first, in the length of the runs that the report is on.
+    """
+    seconds = max(len(log) for log in logs) * system.control_dt
     lasting = [found for found in report["effects"] if not effect(found["name"]).random]
     names = dict.fromkeys(found["name"] for found in lasting)
-    units = units_of([effect(name) for name in names], system.robot)
+    units = units_of([effect(name).forms(seconds)[0] for name in names], system.robot)
     by_place = {(unit.name, unit.where): unit for unit in units}
     return {
         by_place[found["name"], where]: strength
