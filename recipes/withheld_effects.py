@@ -157,7 +157,9 @@ def examine(case: Path, report: Path, *, seed: int) -> None:
     begun = time.perf_counter()
     try:
         system = System.load(case / "system.yaml")
-        found = diagnose(system, None, read_logs(case, system), seed=seed).to_dict()
+        said = diagnose(system, None, read_logs(case, system), seed=seed)
+        # frequencies, phases and the like, which the report's form has no place for
+        found = said.to_dict() | {"options": {e.name: dict(vars(e)) for e in said.strengths}}
     except Exception as error:
         found = {"verdict": "crash", "summary": f"{type(error).__name__}: {error}"}
     found["seconds"] = time.perf_counter() - begun

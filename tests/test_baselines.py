@@ -151,6 +151,20 @@ def test_what_goes_wrong_is_the_answer(tmp_path):
     assert set(found) == set(METHODS)
 
 
+def test_a_named_effect_is_simulated_as_its_report_has_it(tmp_path, plain):
+    from withheld.shrinkage import _named
+
+    system = System.load(written(plain, tmp_path) / "system.yaml")
+    logs = read_logs(tmp_path, system)
+    found = {"name": "cogging", "where": "hinge", "strengths": {"hinge": 0.1}}
+    report = {"effects": [found], "options": {"cogging": {"number": 12, "phase": 0.5}}}
+    ((unit, strength),) = _named(system, report, logs).items()
+    assert vars(unit.effect) == {"number": 12, "phase": 0.5}
+    assert strength == 0.1
+    lost = {"name": "packet_drop", "where": "motor", "strengths": {"motor": 0.1}}
+    assert _named(system, {"effects": [lost]}, logs) == {}
+
+
 def test_one_who_knows_all_strengths_names_the_cause(tmp_path, rubbing):
     from withheld.folders import label
     from withheld.oracle import named_by_oracle

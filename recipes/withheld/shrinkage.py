@@ -107,12 +107,17 @@ def _theta(report: Mapping[str, Any], kind: str) -> list[float]:
 def _named(system: System, report: Mapping[str, Any], logs: Sequence[Log]) -> dict[Unit, float]:
     """Return the strengths that a report names, at single targets; none of chance.
 
-    Of an effect's forms the first, in the length of the runs that the report is on.
+    Of an effect's forms that with the options that a report has, such as a frequency; else the
+    first, in the length of the runs that the report is on.
     """
-    seconds = max(len(log) for log in logs) * system.control_dt
+    seconds, options = max(len(log) for log in logs) * system.control_dt, report.get("options", {})
     lasting = [found for found in report["effects"] if not effect(found["name"]).random]
     names = dict.fromkeys(found["name"] for found in lasting)
-    units = units_of([effect(name).forms(seconds)[0] for name in names], system.robot)
+    kinds = [
+        effect(name, **options[name]) if name in options else effect(name).forms(seconds)[0]
+        for name in names
+    ]
+    units = units_of(kinds, system.robot)
     by_place = {(unit.name, unit.where): unit for unit in units}
     return {
         by_place[found["name"], where]: strength
