@@ -51,3 +51,10 @@ def test_what_acts_alike_and_explains_much_of_the_rest_is_not_told_apart():
     other = model(3.0, "coulomb_friction", "action_delay")
     found = selection(best, beside, other)
     assert confusion_set(found, "coulomb_friction") == ("coulomb_friction", "stribeck_friction")
+
+
+def test_a_part_of_the_best_model_is_no_rival_of_it():
+    best = model(1.0, "action_delay", "dead_band")
+    part = model(1.0, "dead_band")
+    found = Selection(model(11.0), best, (), (), (part,), {"action_delay": (part,)})
+    assert confusion_set(found, "action_delay") == ("action_delay",)

@@ -91,6 +91,7 @@ def rivals(selection: Selection, name: str, *, form: float = _LAST) -> list[Mode
     return [
         m
         for m in selection.alternatives.get(name, ())
+        if not set(m.units) <= set(selection.best.units)
         if as_good(selection.best, m) or _another_form(selection, m, name, form=form)
     ]
 
