@@ -202,7 +202,9 @@ class SummaryStatistics(TensorDictModuleBase):
     """Summaries of a batch of trajectories: a TensorDict module, and a collector's ``postproc``.
 
     Turns a batch of size ``[*, T]`` into one of size ``[*]`` with the summary and, where present,
-    the parameters of each row's first trajectory.
+    the parameters of each row's first trajectory. A row counts from its first step on: as a
+    ``postproc`` it needs a collector with ``reset_at_each_iter=True``, or the later batches of an
+    episode are summarised as if they were trajectories of their own.
 
     Args:
         *functions: Summaries; their values are concatenated. One whose value depends on the order
