@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,7 @@ from withheld.shrinkage import gaps_removed, true_shrinkage
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.errors import message
+from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.read import read_logs
 from torchrl_bayessim.logs.system import System
 from torchrl_bayessim.whole_file import replacing, write_text
@@ -163,7 +164,6 @@ def examine(case: Path, report: Path, *, seed: int) -> None:
     except Exception as error:
         found = {"verdict": "crash", "summary": f"{type(error).__name__}: {error}"}
     found["seconds"] = time.perf_counter() - begun
-    report.parent.mkdir(exist_ok=True)
     write_text(report, json.dumps(scoring.finite(found)))
 
 
@@ -174,7 +174,6 @@ def ask_baselines(out: Path, name: str, *, seed: int) -> None:
         return
     report = json.loads((out / "reports" / f"{name}.json").read_text())
     budget = report.get("audit", {}).get("simulator_steps", 0)
-    file.parent.mkdir(exist_ok=True)
     said = methods.answers(out / "cases" / name, budget=budget, seed=seed)
     write_text(file, json.dumps(scoring.finite(said)))
 
@@ -186,23 +185,25 @@ def scored(
     found: dict[str, list[dict[str, Any]]] = {}
     for name in sorted(labels):
         reports = reports_of(out, name, baselines=settings.baselines)
+        case, unseen = out / "cases" / name, out / "sealed" / name / "unseen.npz"
+        system = System.load(case / "system.yaml")
+        logs = read_logs(case, system)
         removed: Mapping[str, float | None] = {}
         if settings.baselines:
-            system = System.load(out / "cases" / name / "system.yaml")
-            logs = read_logs(out / "cases" / name, system)
-            removed = gaps_removed(system, logs, out / "sealed" / name / "unseen.npz", reports)
+            removed = gaps_removed(system, logs, unseen, reports)
         for method, report in reports.items():
-            shrinks = realised(out, name, report)
+            names = report["verdict"] in scoring.NAMING
+            shrinks = true_shrinkage(system, logs, unseen, report) if names else None
             one = scoring.record(labels[name], report, shrinks) | {"case": name}
             found.setdefault(method, []).append(one | {"removed": removed.get(method)})
-        found[DIAGNOSIS][-1]["regime"] = regime_of(out, name, reports[DIAGNOSIS])
+        found[DIAGNOSIS][-1]["regime"] = overlap(system, logs, unseen, reports[DIAGNOSIS])
         if "names" in labels[name]:
             others = reports_of(out, name + RENAMED, baselines=settings.baselines)
             for method, other in others.items():
                 same = same_answer(reports[method], other, labels[name]["names"])
                 found[method][-1]["same"] = same
         if settings.oracle:
-            found[DIAGNOSIS][-1] |= ask_oracle(out / "cases" / name, labels[name])
+            found[DIAGNOSIS][-1] |= ask_oracle(system, logs, labels[name])
     return found
 
 
@@ -214,31 +215,13 @@ def reports_of(out: Path, name: str, *, baselines: bool) -> dict[str, dict[str, 
     return said
 
 
-def ask_oracle(case: Path, label: Mapping[str, Any]) -> dict[str, Any]:
+def ask_oracle(system: System, logs: Sequence[Log], label: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the oracle names, where one cause is true and nothing is left to chance."""
     true = [truth["name"] for truth in label["truths"]]
     if label["tier"] not in {"T1", "T2", "T6", "T6B"} or len(true) != 1 or effect(true[0]).random:
         return {}
-    system = System.load(case / "system.yaml")
-    said = named_by_oracle(system, read_logs(case, system), label)
+    said = named_by_oracle(system, logs, label)
     return {"oracle": said, "oracle_class": class_of(said) == class_of(true[0])}
-
-
-def realised(out: Path, name: str, report: Mapping[str, Any]) -> float | None:
-    """Return how far the gap truly shrinks, in motions that the diagnosis never saw."""
-    case = out / "cases" / name
-    if not report.get("effects") or report["verdict"] not in scoring.NAMING:
-        return None
-    system = System.load(case / "system.yaml")
-    logs = read_logs(case, system)
-    return true_shrinkage(system, logs, out / "sealed" / name / "unseen.npz", report)
-
-
-def regime_of(out: Path, name: str, report: Mapping[str, Any]) -> dict[str, float] | None:
-    """Return how the rule that a report gives overlaps with when the cause acts."""
-    case = out / "cases" / name
-    system = System.load(case / "system.yaml")
-    return overlap(system, read_logs(case, system), out / "sealed" / name / "unseen.npz", report)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from .errors import SimulationError, message
 from .randomness import isolated, seed_from
 from .sources import Grid
 from .trajectories import concatenate, first_trajectories
-from .transforms.domain_randomizer import DomainRandomizer
+from .transforms.domain_randomizer import DomainRandomizer, randomizers
 
 
 class RealSystem(Protocol):
@@ -146,40 +146,46 @@ class SurrogateRobot:
                 )
             rows.append(batch.reshape(-1, batch.shape[-1]))
         real = first_trajectories(concatenate(rows)[:episodes])
-        self._check_finite(real)
+        lost = _not_finite(real, [*self.measured, *(_next(entry) for entry in self.measured)])
+        if lost is not None:
+            entry, row, step = lost
+            expected = f"a robot that measures finite values of {entry!r}"
+            got = f"NaN or infinity in episode {row} at step {step}"
+            hint = "does its simulation diverge at these parameters? Let it end the episode"
+            raise SimulationError(message(expected, got, hint=hint))
         following = [*self.measured, "reward", "done", "terminated", "truncated"]
         reported = [*self.measured, "action", "mask", *(_next(entry) for entry in following)]
         return real.select(*reported, strict=False)
 
-    def _check_finite(self, real: TensorDictBase) -> None:
-        mask: Tensor = real.get("mask")
-        for entry in (*self.measured, *(_next(entry) for entry in self.measured)):
-            value = real.get(entry)
-            good = value.isfinite().reshape(*mask.shape, -1).all(-1) | ~mask
-            if not good.all():
-                row, step = (~good).nonzero()[0].tolist()
-                expected = f"a robot that measures finite values of {entry!r}"
-                got = f"NaN or infinity in episode {row} at step {step}"
-                hint = "does its simulation diverge at these parameters? Let it end the episode"
-                raise SimulationError(message(expected, got, hint=hint))
-
 
 def _check_not_randomized(env: EnvBase) -> None:
-    while isinstance(env, TransformedEnv):
-        if any(isinstance(module, DomainRandomizer) for module in env.transform.modules()):
-            raise ValueError(
-                message(
-                    "an environment whose parameters the robot alone sets",
-                    "a DomainRandomizer among its transforms",
-                    hint="TransformedEnv(simulator, ApplyPhysics(physics))",
-                )
+    if next(randomizers(env), None) is not None:
+        raise ValueError(
+            message(
+                "an environment whose parameters the robot alone sets",
+                "a DomainRandomizer among its transforms",
+                hint="TransformedEnv(simulator, ApplyPhysics(physics))",
             )
-        env = env.base_env
+        )
 
 
 def _digest(*tensors: Tensor) -> str:
     content = [(str(t.dtype), t.detach().cpu().tolist()) for t in tensors]
     return blake2b(repr(content).encode(), digest_size=8).hexdigest()
+
+
+def _not_finite(
+    trajectories: TensorDictBase, entries: Sequence[NestedKey]
+) -> tuple[NestedKey, int, int] | None:
+    """Return the first entry, trajectory and step that counts and is not finite, if any is."""
+    mask: Tensor = trajectories.get("mask")
+    for entry in entries:
+        finite = trajectories.get(entry).isfinite().reshape(*mask.shape, -1).all(-1)
+        lost = (mask & ~finite).nonzero()
+        if len(lost):
+            row, step = lost[0].tolist()
+            return entry, row, step
+    return None
 
 
 def _next(entry: NestedKey) -> NestedKey:
@@ -244,7 +250,16 @@ class RecordedLogs:
                     "trajectories [n, T] of at least one step each", tuple(trajectories.batch_size)
                 )
             )
-        self._check_finite(trajectories)
+        lost = _not_finite(trajectories, ["observation", "action", ("next", "observation")])
+        if lost is not None:
+            name, row, step = lost
+            raise ValueError(
+                message(
+                    f"finite values of {name!r}",
+                    f"NaN or infinity in trajectory {row} at step {step}",
+                    hint="cut the log there, or repair it",
+                )
+            )
         self.trajectories = trajectories
 
     @property
@@ -252,21 +267,6 @@ class RecordedLogs:
         """What tells these logs from others."""
         entries = ("observation", "action", ("next", "observation"), "mask")
         return {"logs": _digest(*(self.trajectories.get(entry) for entry in entries))}
-
-    @staticmethod
-    def _check_finite(trajectories: TensorDictBase) -> None:
-        mask: Tensor = trajectories.get("mask")
-        for name in ("observation", "action", ("next", "observation")):
-            good = trajectories.get(name).isfinite().all(-1) | ~mask
-            if not good.all():
-                row, step = (~good).nonzero()[0].tolist()
-                raise ValueError(
-                    message(
-                        f"finite values of {name!r}",
-                        f"NaN or infinity in trajectory {row} at step {step}",
-                        hint="cut the log there, or repair it",
-                    )
-                )
 
     def rollouts(
         self,

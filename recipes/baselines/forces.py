@@ -124,7 +124,7 @@ def columns(system: System, steps: Forces) -> dict[tuple[str, int], Array]:
         found["sensor_bias", j] = -bent
         for name, values in _laws(steps, j).items():
             found[name, j] = np.outer(values, np.eye(model.nv)[j])
-    return {place: column for place, column in found.items() if np.ptp(column) or np.any(column)}
+    return {place: column for place, column in found.items() if np.any(column)}
 
 
 def _tilted(model: mujoco.MjModel) -> None:

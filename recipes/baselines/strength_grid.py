@@ -5,9 +5,9 @@ No parameter is refitted: what a wrong mass does is then put down to whatever re
 
 from __future__ import annotations
 
-__all__ = ["best_of_grid", "scan", "strength_grid"]
+__all__ = ["best_of_grid", "best_strengths", "on_grid", "scan", "strength_grid"]
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -31,18 +31,30 @@ def strength_grid(runs: Runs) -> dict[str, Any]:
 
 def scan(objective: Objective, z: Array, units: tuple[Unit, ...]) -> dict[Unit, float]:
     """Return the strength of each unit, on the grid, that leaves least error."""
-    tried = [
-        (unit, sign * level * unit.high)
+    best = best_strengths(objective, z, on_grid(units, _LEVELS))
+    return {unit: strength for unit, (_, strength) in best.items()}
+
+
+def on_grid(units: Sequence[Unit], levels: Iterable[float]) -> list[tuple[Unit, float]]:
+    """Return each unit at each share of its range, and at the opposite where it has one."""
+    return [
+        (unit, sign * float(level) * unit.high)
         for unit in units
-        for level in _LEVELS
+        for level in levels
         for sign in ((1.0, -1.0) if unit.low < 0 else (1.0,))
     ]
+
+
+def best_strengths(
+    objective: Objective, z: Array, tried: Sequence[tuple[Unit, float]]
+) -> dict[Unit, tuple[float, float]]:
+    """Return the least mean square of each unit, and the strength that leaves it."""
     innovations = objective([Point(z, {unit: strength}) for unit, strength in tried])
     errors = (innovations**2).mean((1, 2))
     best: dict[Unit, tuple[float, float]] = {}
     for (unit, strength), error in zip(tried, errors.tolist(), strict=True):
         best[unit] = min(best.get(unit, (np.inf, 0.0)), (error, strength))
-    return {unit: strength for unit, (_, strength) in best.items()}
+    return best
 
 
 def best_of_grid(runs: Runs, nominal: Point, points: Mapping[Unit, Point]) -> dict[str, Any]:

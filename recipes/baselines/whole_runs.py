@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_bayessim.diagnosis.noise import assumed_noise
 from torchrl_bayessim.diagnosis.objective import Objective, Unit, origin, units_of
 from torchrl_bayessim.diagnosis.prediction import Predictor
 from torchrl_bayessim.diagnosis.preparation import split
 from torchrl_bayessim.diagnosis.segments import Segments, cut
-from torchrl_bayessim.diagnosis.tangent import Tangent
 from torchrl_bayessim.diagnosis.time_steps import with_fewest_steps
-from torchrl_bayessim.diagnosis.whitening import Whitening, noise_from_differences
+from torchrl_bayessim.diagnosis.whitening import Whitening
 from torchrl_bayessim.effects.catalogue import CATALOGUE, effect
 from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.system import System
@@ -52,7 +52,8 @@ class Runs:
 
 def whole_runs(system: System, logs: Sequence[Log]) -> Runs:
     """Return the runs of a case, ready to be simulated under any parameters and effects."""
-    parts, noise = split(logs), _noise(system, logs)
+    predictor = Predictor(system, threads=1)
+    parts, noise = split(logs), assumed_noise(predictor, logs)
     steps = min(len(log) for log in logs) - 1
     history = round(_HISTORY / system.control_dt)
     runs = {n: cut(part, steps, history=history, checks=_CHECKS) for n, part in parts.items()}
@@ -61,7 +62,7 @@ def whole_runs(system: System, logs: Sequence[Log]) -> Runs:
     every = units_of([effect(name).forms(seconds)[0] for name in names], system.robot)
     units = tuple(unit for unit in every if not unit.effect.random)
     predictor = with_fewest_steps(
-        Predictor(system, threads=1), runs["train"], units, z=origin(system.prior), noise=noise
+        predictor, runs["train"], units, z=origin(system.prior), noise=noise
     )
     sets = {
         name: Objective(predictor, system.prior, some, _divided_by(noise, some))
@@ -73,18 +74,6 @@ def whole_runs(system: System, logs: Sequence[Log]) -> Runs:
 def mean_square(innovations: Array) -> float:
     """Return the mean squared residual in units of the noise: 1 for a perfect simulator."""
     return float(np.mean(innovations**2))
-
-
-def _noise(system: System, logs: Sequence[Log]) -> Array:
-    tangent, channels = Tangent(system.task.model), list(system.channel_index)
-    values = []
-    for log in logs:
-        qpos = log.qpos.numpy()
-        both = [tangent.difference(qpos[:1], qpos), log.qvel.numpy()]
-        values.append(np.concatenate(both, -1)[:, channels])
-    guess = noise_from_differences(logs, values)
-    told = [system.noise.get(name, np.nan) for name in system.robot.channels]
-    return np.where(np.isnan(told), guess, told)
 
 
 def _divided_by(noise: Array, runs: Segments) -> Whitening:

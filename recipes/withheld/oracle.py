@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from baselines.strength_grid import best_strengths, on_grid
 
-from torchrl_bayessim.diagnosis.objective import Objective, Point, Unit, units_of
+from torchrl_bayessim.diagnosis.objective import Objective, Unit, units_of
 from torchrl_bayessim.diagnosis.prediction import Predictor
 from torchrl_bayessim.diagnosis.segments import cut
 from torchrl_bayessim.diagnosis.time_steps import with_fewest_steps
@@ -40,13 +41,7 @@ def named_by_oracle(system: System, logs: Sequence[Log], label: Mapping[str, Any
         label: What is true: ``theta`` by parameter, ``noise`` of the tangent coordinates.
     """
     objective, units, z = _known(system, logs, label)
-    levels = [
-        (unit, sign * float(level) * unit.high)
-        for unit in units
-        for level in _LEVELS
-        for sign in ((1.0, -1.0) if unit.low < 0 else (1.0,))
-    ]
-    best = _likeliest(objective, z, levels)
+    best = _likeliest(objective, z, on_grid(units, _LEVELS))
     for count, factors in _ROUNDS:
         tried = [(u, s * float(f)) for u, (_, s) in list(best.items())[:count] for f in factors]
         best = _likeliest(objective, z, tried)
@@ -74,9 +69,5 @@ def _likeliest(
     objective: Objective, z: np.ndarray, tried: Sequence[tuple[Unit, float]]
 ) -> dict[Unit, tuple[float, float]]:
     """Return misfit and strength of each unit at its best, the likeliest unit first."""
-    innovations = objective([Point(z, {unit: strength}) for unit, strength in tried])
-    misfits = (innovations**2).sum((1, 2)).tolist()
-    best: dict[Unit, tuple[float, float]] = {}
-    for (unit, strength), misfit in zip(tried, misfits, strict=True):
-        best[unit] = min(best.get(unit, (np.inf, 0.0)), (misfit, strength))
+    best = best_strengths(objective, z, tried)
     return dict(sorted(best.items(), key=lambda item: item[1][0]))

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..logs.log import Log
-from ..logs.system import System
 from .objective import Objective, Point, Unit, origin, parameters_at
 from .prediction import Predictor
 from .segments import cut_for_fits
@@ -26,7 +25,6 @@ _WORTH = 0.2  # nats per effect that a longer horizon must bring
 
 def chosen_horizon(
     predictor: Predictor,
-    system: System,
     logs: Sequence[Log],
     *,
     units: Sequence[Unit],
@@ -40,7 +38,8 @@ def chosen_horizon(
     range, as long as second differences stay below first ones. Where start states were estimated,
     few steps hardly say how a segment began, and nothing else.
     """
-    z = origin(system.prior)
+    prior = predictor.system.prior
+    z = origin(prior)
     units = list({unit.name: unit for unit in units}.values())
     typical = float(np.median([len(log) for log in logs]))
     guessed = any(log.uncertainty is not None for log in logs)
@@ -50,10 +49,10 @@ def chosen_horizon(
         if steps > typical * (_LARGEST_UNSURE if guessed else _LARGEST):
             break
         pieces = cut_for_fits(logs, steps, history=history, most=max(4, _PROBE // steps))
-        white = whitening(predictor, pieces, parameters_at(system.prior, z), noise)
+        white = whitening(predictor, pieces, parameters_at(prior, z), noise)
         if white.curvature > 1.0 and np.isfinite(best):
             break
-        objective = Objective(predictor, system.prior, pieces, white)
+        objective = Objective(predictor, prior, pieces, white)
         points = [Point(z), *(Point(z, {unit: 0.1 * unit.high}) for unit in units)]
         innovations = objective(points)
         change = ((innovations[1:] - innovations[0]) ** 2).sum((1, 2))

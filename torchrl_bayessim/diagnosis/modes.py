@@ -60,8 +60,7 @@ class Mode:
             history: Rows before a segment that effects look back at.
             alarms: To which is added what the reader must know.
         """
-        system = predictor.system
-        return measured_noise(system, predictor, logs, history=history, alarms=alarms)
+        return measured_noise(predictor, logs, history=history, alarms=alarms)
 
     def horizon(
         self,
@@ -82,7 +81,7 @@ class Mode:
             history: Rows before a segment that effects look back at.
         """
         horizon = chosen_horizon(
-            predictor, predictor.system, parts["train"], units=units, noise=noise, history=history
+            predictor, parts["train"], units=units, noise=noise, history=history
         )
         return min(horizon, shortest(parts) // 2)
 
@@ -174,7 +173,7 @@ class Summaries(Mode):
         alarms: list[str],  # noqa: ARG002
     ) -> tuple[Array, str]:
         """Return what is known without predictions."""
-        noise = assumed_noise(predictor.system, predictor, logs)
+        noise = assumed_noise(predictor, logs)
         return noise, "the sensors' specification, or else third differences"
 
     def horizon(

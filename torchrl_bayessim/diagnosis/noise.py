@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..logs.log import Log
-from ..logs.system import System
 from .objective import Objective, Point, origin, parameters_at, pushes_of
 from .prediction import Predictor
 from .refit import refit
@@ -20,8 +19,9 @@ from .whitening import innovation_noise, noise_from_differences, whitening
 Array = NDArray[np.float64]
 
 
-def assumed_noise(system: System, predictor: Predictor, logs: Sequence[Log]) -> Array:
+def assumed_noise(predictor: Predictor, logs: Sequence[Log]) -> Array:
     """Return what the sensor's spec says, or else third differences, shape ``(C,)``."""
+    system = predictor.system
     smooth = noise_from_differences(logs, [_coordinates(predictor, log) for log in logs])
     given = np.array([system.noise.get(name, np.nan) for name in system.robot.channels])
     tiny = 1e-6 * system.robot.channel_scale.numpy()
@@ -29,15 +29,10 @@ def assumed_noise(system: System, predictor: Predictor, logs: Sequence[Log]) -> 
 
 
 def measured_noise(
-    system: System,
-    predictor: Predictor,
-    logs: Sequence[Log],
-    *,
-    history: int,
-    alarms: list[str],
+    predictor: Predictor, logs: Sequence[Log], *, history: int, alarms: list[str]
 ) -> tuple[Array, str]:
     """Return each channel's noise: the differences of innovations, checked by the sensor's spec."""
-    noise = assumed_noise(system, predictor, logs)
+    system, noise = predictor.system, assumed_noise(predictor, logs)
     channels, tiny = system.robot.channels, 1e-6 * system.robot.channel_scale.numpy()
     given = np.array([system.noise.get(name, np.nan) for name in channels])
     steps = min(8, min(len(log) for log in logs) // 2)

@@ -152,11 +152,11 @@ def prepare(
             "runs, and intervals are too narrow"
         )
     history = min(max(8, round(_HISTORY / system.control_dt)), 100)
-    parts = _completed(predictor, system, parts, history=history, alarms=alarms)
+    noise = assumed_noise(predictor, parts["train"])
+    parts = _completed(predictor, parts, noise=noise, history=history, alarms=alarms)
     estimated = parts["train"][0].uncertainty is not None
     mode = mode or (Trajectories() if estimated else Mode())
     some = cut(parts["train"], min(_STEPS, rows // 2), history=history, most=_FEW)
-    noise = assumed_noise(system, predictor, parts["train"])
     predictor = with_fewest_steps(predictor, some, units, z=origin(system.prior), noise=noise)
     noise, source = mode.noise(predictor, parts["train"], history=history, alarms=alarms)
     if horizon is None:
@@ -171,9 +171,9 @@ def prepare(
 
 def _completed(
     predictor: Predictor,
-    system: System,
     parts: Mapping[str, list[Log]],
     *,
+    noise: Array,
     history: int,
     alarms: list[str],
 ) -> dict[str, list[Log]]:
@@ -181,20 +181,20 @@ def _completed(
 
     They and the parameters that they depend on are fitted in turn.
     """
-    noise = assumed_noise(system, predictor, parts["train"])
-    theta = parameters_at(system.prior, origin(system.prior))
+    prior = predictor.system.prior
+    theta = parameters_at(prior, origin(prior))
     steps = min(_STEPS, shortest(parts) // 2)
     some = cut(parts["train"], steps, history=history, most=_FEW)
     hidden = hidden_joints(predictor, some, theta, noise)
     if not hidden:
         return dict(parts)
-    predictor = with_fewest_steps(predictor, some, (), z=origin(system.prior), noise=noise)
+    predictor = with_fewest_steps(predictor, some, (), z=origin(prior), noise=noise)
     curvature = 0.0
-    for _ in range(_ROUNDS if system.prior is not None else 1):
+    for _ in range(_ROUNDS if prior is not None else 1):
         train = hidden.estimated(predictor, parts["train"], theta=theta, noise=noise)
         pieces = cut_for_fits(train, steps, history=history, most=_MANY)
         fit, sets = _nominal(predictor, {"train": pieces}, Mode(), noise=noise)
-        theta = parameters_at(system.prior, fit.point.z)
+        theta = parameters_at(prior, fit.point.z)
         curvature = sets["train"].whitening.curvature
     hidden.require_sure(curvature)
     found = {

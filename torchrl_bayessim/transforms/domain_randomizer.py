@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-__all__ = ["DomainRandomizer"]
+__all__ = ["DomainRandomizer", "randomizers"]
 
+from collections.abc import Iterator
 from typing import Any, Self
 from weakref import ref
 
@@ -146,12 +147,7 @@ class DomainRandomizer(Transform):
 
     def drives(self, env: EnvBase | None) -> bool:
         """Return whether this randomizer, or a clone, is among the transforms of ``env``."""
-        while isinstance(env, TransformedEnv):
-            for module in env.transform.modules():
-                if isinstance(module, DomainRandomizer) and module._shared is self._shared:
-                    return True
-            env = env.base_env
-        return False
+        return any(other._shared is self._shared for other in randomizers(env))
 
     @property
     def collector(self) -> BaseCollector | None:
@@ -192,15 +188,11 @@ class DomainRandomizer(Transform):
 
     def _check_alone(self) -> None:
         """Refuse a second randomizer of the same entry, of which one would be ignored."""
-        env = self.parent
-        while isinstance(env, TransformedEnv):
-            for module in env.transform.modules():
-                other = isinstance(module, DomainRandomizer) and module._shared is not self._shared
-                if other and module.key == self.key:
-                    expected = f"one DomainRandomizer of {self.key!r}"
-                    hint = "assign to the source of the one that is there, or pin it"
-                    raise PhysicsError(message(expected, "two", hint=hint))
-            env = env.base_env
+        others = (r for r in randomizers(self.parent) if r._shared is not self._shared)
+        if any(other.key == self.key for other in others):
+            expected = f"one DomainRandomizer of {self.key!r}"
+            hint = "assign to the source of the one that is there, or pin it"
+            raise PhysicsError(message(expected, "two", hint=hint))
 
     def _check_names(self) -> None:
         """Compare names with those beside the simulators, once the simulators exist."""
@@ -306,3 +298,10 @@ class DomainRandomizer(Transform):
     def __repr__(self) -> str:
         options = f"names={self.names}, units={self.units}, key={self.key!r}"
         return f"DomainRandomizer({type(self.source).__name__}, {options})"
+
+
+def randomizers(env: EnvBase | None) -> Iterator[DomainRandomizer]:
+    """Yield the randomizers among the transforms of an environment, and of those that it wraps."""
+    while isinstance(env, TransformedEnv):
+        yield from (m for m in env.transform.modules() if isinstance(m, DomainRandomizer))
+        env = env.base_env
