@@ -188,6 +188,13 @@ def test_weights_that_are_none_are_refused(weight):
         value(pairs().set("weight", torch.full((8,), weight)))
 
 
+@pytest.mark.parametrize("kind", ["weight", "mask"])
+def test_there_is_one_weight_and_one_mask_for_each_pair(kind):
+    data = pairs().auto_batch_size_(0).set(kind, torch.ones(7).bool())
+    with pytest.raises(ValueError, match=rf"one {kind} per pair, shape \(8,\), got \(7,\)"):
+        value(data)
+
+
 def test_a_mask_of_floats_is_refused():
     with pytest.raises(TypeError, match=r"booleans in 'mask', got 'torch.float32'"):
         value(pairs().set("mask", torch.ones(8)))

@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_bayessim.inference.features import Features
+from torchrl_bayessim.inference.features import Features, NeuralFeatures
 from torchrl_bayessim.inference.fit import fit
 from torchrl_bayessim.inference.mixtures import moment_match
 from torchrl_bayessim.inference.network import melu
@@ -347,6 +347,11 @@ def test_paper_mode_learns_and_keeps_to_the_support(features):
     assert prior.contains(q.sample((100,))).all()
 
 
+def test_features_are_of_summaries_of_the_given_size():
+    with pytest.raises(ValueError, match="features of summaries of size 3, got 'of size 2'"):
+        MixtureDensityPosterior(ONE["linear"], 3, features=NeuralFeatures(2))
+
+
 def test_paper_mode_knows_its_feature_maps():
     with pytest.raises(ValueError, match="the name of a feature map"):
         MixtureDensityPosterior.paper_mode(BoxPrior({"a": (0.0, 1.0)}), 2, features="rff")
@@ -367,8 +372,9 @@ def test_a_loaded_posterior_is_the_saved_one_and_warns_as_it_did(tmp_path):
     near, theta = summaries(1, 2), ONE["linear"].sample((5,))
     densities = [each.condition(near).log_prob(theta) for each in (saved, loaded)]
     assert torch.equal(*densities)
-    with pytest.warns(UserWarning, match="1 of 1 real summaries lie as far out"):
+    with pytest.warns(UserWarning, match="1 of 1 real summaries lie as far out") as warned:
         loaded.condition(near + 100)
+    assert warned[0].filename == __file__  # not in torch
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase, GymEnv, TransformedEnv
 
+from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
 from torchrl_bayessim.errors import PhysicsError
 from torchrl_bayessim.physics.attributes import AttributePhysics
 from torchrl_bayessim.physics.conformance import PhysicsTests
@@ -156,3 +157,31 @@ class TestBlock(PhysicsTests):
 def test_a_flag_is_not_a_parameter():
     with pytest.raises(PhysicsError, match=r"attribute of BlockEnv, got 'on_rails'\. .*drag, mass"):
         TransformedEnv(BlockEnv(), ApplyPhysics(AttributePhysics("on_rails")))
+
+
+@pytest.mark.parametrize(
+    ("name", "parameter", "value"),
+    [
+        ("CartPole-v1", "masspole", -0.1),
+        ("Pendulum-v1", "dt", 0.0),
+        ("Acrobot-v1", "LINK_MOI", -1.0),
+    ],
+)
+def test_masses_lengths_and_times_are_positive(name, parameter, value):
+    env = make(name, parameter)
+    nominal = env.reset()["theta"]
+    with pytest.raises(PhysicsError, match=f"{parameter} to be positive, got {value}"):
+        env.reset(TensorDict(theta=torch.tensor([value])))
+    env.reset(TensorDict(theta=nominal))
+    assert getattr(env.unwrapped, parameter) == pytest.approx(nominal.item())
+
+
+def test_only_the_environments_that_are_written_are_checked():
+    env = TransformedEnv(CartPoleEnv(2), ApplyPhysics(AttributePhysics("length")))
+    theta = torch.tensor([[-1.0], [0.5]])
+    with pytest.raises(PhysicsError, match="length to be positive, got -1"):
+        env.reset(TensorDict(theta=theta, batch_size=[2]))
+    reset = torch.tensor([[False], [True]])
+    env.reset()
+    env.reset(TensorDict(theta=theta, _reset=reset, batch_size=[2]))
+    assert env.base_env.parameters["length"].tolist() == [0.5, 0.5]

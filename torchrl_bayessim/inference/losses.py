@@ -41,7 +41,8 @@ class PosteriorLoss(LossModule):
     Raises:
         KeyError: In a call, for pairs without parameters or summaries.
         TypeError: For masks that are not booleans.
-        ValueError: For weights that are negative or not finite; for a mean or sum over pairs that
+        ValueError: For weights or masks of another number than the pairs, weights that are negative
+            or not finite; for a mean or sum over pairs that
             are not finite or outside the prior.
 
     Example:
@@ -117,19 +118,27 @@ class PosteriorLoss(LossModule):
         """Return the weight of every pair, 0 where masked."""
         shape = theta.shape[:-1]
         weight = tensordict.get(self.tensor_keys.weight, None)
-        weight = theta.new_ones(shape) if weight is None else weight.reshape(shape)
+        weight = theta.new_ones(shape) if weight is None else _one_each("weight", weight, shape)
         for key in dict.fromkeys([self.tensor_keys.mask, ("collector", "mask")]):
             mask = tensordict.get(key, None)
             if mask is None:
                 continue
             if mask.dtype != torch.bool:
                 raise TypeError(message(f"booleans in {key!r}", str(mask.dtype)))
-            weight = torch.where(mask.reshape(shape), weight, 0.0)
+            weight = torch.where(_one_each("mask", mask, shape), weight, 0.0)
         if not (weight >= 0).all() or weight.isinf().any():
             bad = weight[~(weight >= 0) | weight.isinf()]
             expected = "finite weights of 0 or more"
             raise ValueError(message(expected, f"{len(bad)} others, the first {bad[0].item():.3g}"))
         return weight
+
+
+def _one_each(kind: str, values: Tensor, shape: torch.Size) -> Tensor:
+    """Return one value per pair, in the pairs' shape."""
+    if values.numel() != shape.numel():
+        expected = f"one {kind} per pair, shape {tuple(shape)}"
+        raise ValueError(message(expected, tuple(values.shape)))
+    return values.reshape(shape)
 
 
 def _explain(summaries: list[Tensor], theta: Tensor, bad: Tensor, *, prior: Prior | None) -> None:

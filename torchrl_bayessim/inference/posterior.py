@@ -70,8 +70,8 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
 
     Raises:
         TypeError: The prior is none of :mod:`.priors`.
-        ValueError: An unknown feature map; when a state is loaded, one of another prior or another
-            ``compress``.
+        ValueError: An unknown feature map, or one of summaries of another size; when a state is
+            loaded, one of another prior or another ``compress``.
 
     Example:
         >>> from tensordict import TensorDict
@@ -105,6 +105,9 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
             )
         if isinstance(features, str) and features not in MAPS:
             raise ValueError(message("the name of a feature map", features, available=MAPS))
+        if isinstance(features, Features) and features.dim != summary_dim:
+            expected = f"features of summaries of size {summary_dim}"
+            raise ValueError(message(expected, f"of size {features.dim}", hint="summary_dim"))
         network = MixtureDensityNetwork(
             features if isinstance(features, Features) else MAPS[features](summary_dim, seed=seed),
             len(prior.names),
@@ -233,7 +236,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         found = PhysicsPosterior(pool(each, bounded=self.prior.box is not None), self.prior)
         if check and self.seen is not None:
             for doubt in doubts(self.seen.to(summaries), summaries, found):
-                warnings.warn(doubt, stacklevel=2)
+                warnings.warn(doubt, stacklevel=3)  # past the decorator
         return found
 
     def get_extra_state(self) -> dict[str, Any]:

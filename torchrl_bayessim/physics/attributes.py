@@ -33,12 +33,19 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ..errors import PhysicsError, message
+from .protocol import simulator_of
 
 _UNITS = {
     "masspole": "kg", "masscart": "kg", "length": "m", "gravity": "m/s²", "force_mag": "N",
     "tau": "s", "m": "kg", "l": "m", "g": "m/s²", "dt": "s", "max_torque": "N m",
     "max_speed": "rad/s", "LINK_MASS_1": "kg", "LINK_MASS_2": "kg", "LINK_LENGTH_1": "m",
     "LINK_LENGTH_2": "m", "LINK_COM_POS_1": "m", "LINK_COM_POS_2": "m", "LINK_MOI": "kg m²",
+}  # fmt: skip
+
+
+_POSITIVE = {
+    "masspole", "masscart", "length", "tau", "m", "l", "dt", "max_torque", "max_speed",
+    "LINK_MASS_1", "LINK_MASS_2", "LINK_LENGTH_1", "LINK_LENGTH_2", "LINK_MOI",
 }  # fmt: skip
 
 
@@ -55,7 +62,8 @@ class AttributePhysics:
             ``m l² / 12`` about it, for each link. By default they stay gymnasium's constants.
 
     Raises:
-        PhysicsError: The simulator has no such number. (Environments are checked when wrapped.)
+        PhysicsError: The simulator has no such number (environments are checked when wrapped); in a
+            write, a mass, length, time or limit of the table above that is not positive.
 
     Example:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -84,6 +92,7 @@ class AttributePhysics:
         del tensordict
         target = _target(env)
         self._check(target)
+        self._check_values(theta, mask)
         if _is_batched(target):
             target.set_parameters(dict(zip(self.names, theta.unbind(-1), strict=True)), mask)
         elif mask.all():
@@ -108,6 +117,12 @@ class AttributePhysics:
                 what = f"a numeric attribute of {type(target).__name__}"
                 raise PhysicsError(message(what, name, available=sorted(numbers)))
 
+    def _check_values(self, theta: Tensor, mask: Tensor) -> None:
+        for name, values in zip(self.names, theta.unbind(-1), strict=True):
+            wrong = mask.reshape(values.shape) & ~(values > 0)
+            if name in _POSITIVE and wrong.any():
+                raise PhysicsError(message(f"{name} to be positive", values[wrong][0].item()))
+
     def _couple(self, target: Any) -> None:
         if isinstance(target, CartPoleEnv):
             target.total_mass = target.masspole + target.masscart
@@ -120,10 +135,7 @@ class AttributePhysics:
 
 
 def _target(env: EnvBase) -> Any:
-    if _is_batched(env):
-        return env
-    inner = env.__dict__.get("_env", env)
-    return getattr(inner, "unwrapped", inner)
+    return env if _is_batched(env) else simulator_of(env)
 
 
 def _is_batched(target: Any) -> bool:

@@ -18,6 +18,7 @@ from .derived import derive
 from .frames import separate
 from .geom_bounds import fit_bounds
 from .idle import Place
+from .protocol import simulator_of
 
 
 class MujocoModels:
@@ -149,8 +150,7 @@ def models_of(env: Any) -> MujocoModels:
 
 
 def _model(env: Any) -> mujoco.MjModel:
-    inner = env.__dict__.get("_env", env)  # inside GymEnv, DMControlEnv
-    inner = getattr(inner, "unwrapped", inner)
+    inner = simulator_of(env)
     inner = getattr(inner, "physics", inner)  # of dm_control
     backend = env.__dict__.get("_backend")  # of TorchRL's MujocoEnv
     if backend is not None and isinstance(getattr(backend, "_d", None), mujoco.MjData):

@@ -7,9 +7,9 @@ twice is writing it once, and nothing is ever scaled in place.
 
 from __future__ import annotations
 
-__all__ = ["Physics"]
+__all__ = ["Physics", "simulator_of"]
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -56,3 +56,15 @@ class Physics(Protocol):
     def read(self, env: EnvBase, *, tensordict: TensorDictBase) -> Tensor:
         """Return the values in force now, shape ``(*batch, D)``."""
         ...
+
+
+def simulator_of(env: Any) -> Any:
+    """Return the simulator inside ``GymEnv`` or ``DMControlEnv``, or the environment itself.
+
+    Example:
+        >>> from torchrl.envs import GymEnv
+        >>> type(simulator_of(GymEnv("CartPole-v1"))).__name__
+        'CartPoleEnv'
+    """
+    inner = env.__dict__.get("_env", env)  # not getattr: TorchRL's looks through every wrapper
+    return getattr(inner, "unwrapped", inner)

@@ -19,6 +19,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ..errors import PhysicsError, message
+from .protocol import simulator_of
 
 # the keyword of changeDynamics, and its place in getDynamicsInfo
 _FIELDS = {"lateralFriction": 1, "restitution": 5, "rollingFriction": 6, "spinningFriction": 7}
@@ -90,7 +91,7 @@ def _get(env: EnvBase, field: str, part: str) -> float:
 
 def _locate(env: EnvBase, part: str) -> tuple[Any, tuple[int, int]]:
     """Return the client, and the part's body and link; the first reset builds the world."""
-    inside = env.__dict__["_env"].unwrapped
+    inside = simulator_of(env)
     if not hasattr(inside, "parts"):
         inside.reset()
     if part not in inside.parts:

@@ -17,6 +17,7 @@ from ..envs.mujoco import BatchedMujocoEnv
 from ..envs.task import Task
 from ..errors import PhysicsError, message
 from ..physics.mujoco_models import models_of
+from ..physics.protocol import simulator_of
 
 
 def robot_of_env(env: Any) -> Robot:
@@ -39,7 +40,7 @@ def robot_of_env(env: Any) -> Robot:
         model = models_of(env).model
     except PhysicsError:
         return _robot_of_specs(env)
-    inner = _unwrapped(env)
+    inner = simulator_of(env)
     steps = getattr(inner, "frame_skip", getattr(inner, "n_substeps", None))
     if steps is None and hasattr(inner, "control_timestep"):  # of dm_control
         steps = round(inner.control_timestep() / model.opt.timestep)
@@ -47,7 +48,7 @@ def robot_of_env(env: Any) -> Robot:
 
 
 def _robot_of_specs(env: EnvBase) -> Robot:
-    inner = _unwrapped(env)
+    inner = simulator_of(env)
     dt = getattr(inner, "dt", getattr(inner, "tau", None))
     if dt is None:
         expected = "an environment that says how long a control step is"
@@ -80,13 +81,8 @@ def add_every_time_step(env: Any, key: object, addition: Addition) -> None:
         return
     known: dict[object, Addition] = env.__dict__.setdefault("_additions", {})
     if not known:
-        _wrap(_unwrapped(env), known)
+        _wrap(simulator_of(env), known)
     known[key] = addition
-
-
-def _unwrapped(env: Any) -> Any:
-    inner = env.__dict__.get("_env", env)  # inside GymEnv, DMControlEnv
-    return getattr(inner, "unwrapped", inner)
 
 
 def _wrap(inner: Any, additions: dict[object, Addition]) -> None:
