@@ -16,6 +16,7 @@ from torchrl.envs import (
     Compose,
     GymEnv,
     GymWrapper,
+    RenameTransform,
     RewardSum,
     SerialEnv,
     StepCounter,
@@ -346,6 +347,14 @@ def test_other_settings_must_not_be_negative(name):
         make_loop(**{name: -1})
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("rounds", 1.5), ("episodes", "8"), ("updates", float("nan"))]
+)
+def test_counts_are_whole_numbers(name, value):
+    with pytest.raises(TypeError, match=f"a whole number of {name}, got '?{value}"):
+        make_loop(robot=make_robot(), **{name: value})
+
+
 def test_more_than_ten_rounds():
     loop = make_loop(rounds=12, updates=1, horizon=4, simulations=12)
     turns = list(loop)
@@ -454,6 +463,23 @@ def test_logs_are_simulated_by_replaying_their_actions_as_long_as_they_last(monk
             assert (mask[:, i].sum(-1) == length).logical_or((mask & ended)[:, i].any(-1)).all()
         played = rows["action"][mask]
         assert torch.equal(played, recorded["action"].expand(len(rows), -1, -1, -1)[mask])
+
+
+def test_logs_and_simulator_may_name_the_measurements_in_their_own_way():
+    env, randomizer = make_env()
+    env.append_transform(RenameTransform(["observation"], ["joints"], create_copy=True))
+    recorded = logs().rename_key_("observation", "joints")
+    recorded["next"].rename_key_("observation", "joints")
+    (turn,) = make_loop(
+        env,
+        randomizer,
+        robot=RecordedLogs(recorded, measured=["joints"]),
+        statistics=SummaryStatistics(moments, duration, observation_key="joints"),
+        rounds=1,
+        updates=1,
+    )
+    (same,) = make_loop(robot=RecordedLogs(logs()), rounds=1, updates=1)
+    assert torch.equal(turn.posterior.mixture.loc, same.posterior.mixture.loc)
 
 
 def test_environments_must_be_a_multiple_of_the_logs():

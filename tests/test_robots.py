@@ -187,6 +187,26 @@ def test_empty_logs_are_refused():
         RecordedLogs(logs[:0])
 
 
+def test_what_was_logged_may_have_other_names():
+    steps = log(4)
+    renamed = TensorDict(
+        {
+            "joints": {"angle": steps["observation"]},
+            "torque": steps["action"],
+            "next": {"joints": {"angle": steps["next", "observation"]}},
+        },
+        [4],
+    )
+    names = {"measured": [("joints", "angle")], "action_key": "torque"}
+    logs = RecordedLogs(pad([renamed]), **names)
+    assert logs.rollouts(None, episodes=1, key=(0,))["joints", "angle"].shape == (1, 4, 4)
+    renamed["next", "joints", "angle"][2, 1] = torch.nan
+    with pytest.raises(ValueError, match=r"'next', 'joints', 'angle'.*trajectory 0 at step 2"):
+        RecordedLogs(pad([renamed]), **names)
+    with pytest.raises(TypeError, match=r"a sequence of entries.*Try: measured=\('angle',\)"):
+        RecordedLogs(pad([log(3)]), measured="angle")
+
+
 def test_robots_and_logs_tell_themselves_from_others():
     one, same, other = (SurrogateRobot(batched(), [t], max_steps=5) for t in (0.4, 0.4, 0.4001))
     assert one.settings == same.settings != other.settings

@@ -512,6 +512,14 @@ def test_trajectories_together_need_no_mask_of_the_user():
     assert torch.equal(statistics.together(data.exclude("mask")), statistics.together(data))
 
 
+@pytest.mark.parametrize("shape", [(2, 6), (2, 6, 3, 3)])
+def test_observations_are_vectors(shape):
+    matrices = torch.zeros(shape)
+    data = rows().set("observation", matrices).set(("next", "observation"), matrices)
+    with pytest.raises(ValueError, match=r"vectors in 'observation', shape \(\*, T, D\), got"):
+        SummaryStatistics(moments)(data)
+
+
 @pytest.mark.parametrize("angles", [(7,), (-4,)])
 def test_angles_in_no_column_are_refused(angles):
     with pytest.raises(ValueError, match=r"angles among the 3 columns of 'observation', got \("):

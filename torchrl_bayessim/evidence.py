@@ -134,7 +134,8 @@ class EvidenceSimulator:
             batch = first_trajectories(batch.reshape(-1, steps))
             return batch.set("mask", batch.get("mask") & cut)
 
-        policy = ReplayActions(real.get("action"))
+        key_of_actions = self.statistics.action_key
+        policy = ReplayActions(real.get(key_of_actions), action_key=key_of_actions)
         return self._apart(
             policy, theta, steps=steps, prepare=prepare, trajectories=len(real), key=key
         )

@@ -21,6 +21,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from operator import index
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -43,7 +44,7 @@ from .robots import RealSystem, comparable
 from .simulate import next_batch
 from .sources import Defensive
 from .summaries import SummaryStatistics
-from .trajectories import concatenate
+from .trajectories import concatenate, next_key
 from .transforms.domain_randomizer import DomainRandomizer
 
 
@@ -123,6 +124,11 @@ class SimToRealLoop:
         checkpoint_every: Updates between two checkpoints. Episodes begin anew after each.
         progress: Whether to show progress bars.
 
+    Raises:
+        TypeError: For a count that is no whole number.
+        ValueError: For a count that is too small, or a ``prior_share`` that is no probability; in a
+            round, for a robot whose measurements or actions are not of the simulator's sizes.
+
     Example::
 
         loop = SimToRealLoop(env, ppo, robot, refinement=PosteriorRefinement(prior),
@@ -159,11 +165,9 @@ class SimToRealLoop:
             "environments": max(1, env.batch_size.numel()),
         }
         for name, value in self.settings.items():
-            if value < 1:
-                raise ValueError(message(f"{name} to be positive", value))
+            _check_count(name, value, least=1)
         for name, value in {"updates": updates, "shared_batches": shared_batches}.items():
-            if value < 0:
-                raise ValueError(message(f"{name} not to be negative", value))
+            _check_count(name, value, least=0)
         if not 0 <= prior_share <= 1:
             raise ValueError(message("prior_share to be a probability, 0 to 1", prior_share))
         self.settings |= {
@@ -316,8 +320,7 @@ class SimToRealLoop:
         done = state["round"] * (self.updates + 1) + len(state["curve"])
         key = (self.seed, "round", state["round"], "update", len(state["curve"]))
         seen = [*self.learner.policy.in_keys, "reward"]
-        following = [("next", *([k] if isinstance(k, str) else k)) for k in seen]
-        usable, dropped = finite_rows(batch, [*seen, *following])
+        usable, dropped = finite_rows(batch, [*seen, *map(next_key, seen)])
         reported = self.learner.update(usable, key=key, progress=done / planned)
         state["frames"] += batch.numel()
         entry = {"frames": float(state["frames"]), "return": ended_return(usable), **reported}
@@ -374,6 +377,17 @@ class SimToRealLoop:
 
 
 _FRESH: dict[str, Any] = {"real": None, "fit": None, "update": 0, "curve": [], "seconds": 0.0}
+
+
+def _check_count(name: str, value: Any, *, least: int) -> None:
+    """Refuse what is not a whole number of at least ``least``."""
+    try:
+        index(value)
+    except TypeError:
+        raise TypeError(message(f"a whole number of {name}", value)) from None
+    if value < least:
+        expected = f"{name} to be positive" if least else f"{name} not to be negative"
+        raise ValueError(message(expected, value))
 
 
 def ended_return(batch: TensorDictBase) -> float:

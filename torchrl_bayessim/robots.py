@@ -24,7 +24,7 @@ from .diverged import UndisturbedPolicy
 from .errors import SimulationError, message
 from .randomness import isolated, seed_from
 from .sources import Grid
-from .trajectories import concatenate, first_trajectories
+from .trajectories import concatenate, first_trajectories, next_key
 from .transforms.domain_randomizer import DomainRandomizer, randomizers
 
 
@@ -90,9 +90,7 @@ class SurrogateRobot:
         if max_steps < 1:
             raise ValueError(message("max_steps to be positive", max_steps))
         _check_not_randomized(env)
-        if isinstance(measured, str):
-            hint = f"measured=({measured!r},)"
-            raise TypeError(message("a sequence of entries to measure", measured, hint=hint))
+        _check_sequence(measured)
         self.max_steps, self.measured = max_steps, list(measured)
         try:
             theta = torch.as_tensor(theta, dtype=torch.float32)
@@ -146,7 +144,7 @@ class SurrogateRobot:
                 )
             rows.append(batch.reshape(-1, batch.shape[-1]))
         real = first_trajectories(concatenate(rows)[:episodes])
-        lost = _not_finite(real, [*self.measured, *(_next(entry) for entry in self.measured)])
+        lost = _not_finite(real, [*self.measured, *(next_key(entry) for entry in self.measured)])
         if lost is not None:
             entry, row, step = lost
             expected = f"a robot that measures finite values of {entry!r}"
@@ -154,8 +152,14 @@ class SurrogateRobot:
             hint = "does its simulation diverge at these parameters? Let it end the episode"
             raise SimulationError(message(expected, got, hint=hint))
         following = [*self.measured, "reward", "done", "terminated", "truncated"]
-        reported = [*self.measured, "action", "mask", *(_next(entry) for entry in following)]
+        reported = [*self.measured, "action", "mask", *(next_key(entry) for entry in following)]
         return real.select(*reported, strict=False)
+
+
+def _check_sequence(measured: Sequence[NestedKey]) -> None:
+    if isinstance(measured, str):
+        hint = f"measured=({measured!r},)"
+        raise TypeError(message("a sequence of entries to measure", measured, hint=hint))
 
 
 def _check_not_randomized(env: EnvBase) -> None:
@@ -186,10 +190,6 @@ def _not_finite(
             row, step = lost[0].tolist()
             return entry, row, step
     return None
-
-
-def _next(entry: NestedKey) -> NestedKey:
-    return ("next", entry) if isinstance(entry, str) else ("next", *entry)
 
 
 def comparable(real: TensorDictBase, *, horizon: int) -> TensorDictBase:
@@ -223,19 +223,30 @@ class RecordedLogs:
 
     Args:
         trajectories: Batch size ``[n, T]`` with a ``"mask"``: see :func:`.trajectories.pad`.
+        measured: Entries of the observation that were logged, each with its value a step later
+            under ``"next"``.
+        action_key: Entry of the action.
 
     Raises:
-        TypeError: For what is not a TensorDict.
+        TypeError: For what is not a TensorDict, or ``measured`` that is one name and no sequence.
         ValueError: For no trajectory, missing entries, or measurements that are not finite.
     """
 
     recorded = True
 
-    def __init__(self, trajectories: TensorDictBase) -> None:
+    def __init__(
+        self,
+        trajectories: TensorDictBase,
+        *,
+        measured: Sequence[NestedKey] = ("observation",),
+        action_key: NestedKey = "action",
+    ) -> None:
         if not isinstance(trajectories, TensorDictBase):
             got = type(trajectories).__name__
             raise TypeError(message("trajectories [n, T] in a TensorDict", got, hint="pad(logs)"))
-        for name in ("observation", "action", ("next", "observation"), "mask"):
+        _check_sequence(measured)
+        values = [*measured, action_key, *(next_key(entry) for entry in measured)]
+        for name in (*values, "mask"):
             value = trajectories.get(name, None)
             if value is None:
                 found = sorted(map(str, trajectories.keys(include_nested=True)))
@@ -250,7 +261,7 @@ class RecordedLogs:
                     "trajectories [n, T] of at least one step each", tuple(trajectories.batch_size)
                 )
             )
-        lost = _not_finite(trajectories, ["observation", "action", ("next", "observation")])
+        lost = _not_finite(trajectories, values)
         if lost is not None:
             name, row, step = lost
             raise ValueError(
@@ -260,13 +271,12 @@ class RecordedLogs:
                     hint="cut the log there, or repair it",
                 )
             )
-        self.trajectories = trajectories
+        self.trajectories, self._entries = trajectories, (*values, "mask")
 
     @property
     def settings(self) -> dict[str, Any]:
         """What tells these logs from others."""
-        entries = ("observation", "action", ("next", "observation"), "mask")
-        return {"logs": _digest(*(self.trajectories.get(entry) for entry in entries))}
+        return {"logs": _digest(*(self.trajectories.get(entry) for entry in self._entries))}
 
     def rollouts(
         self,

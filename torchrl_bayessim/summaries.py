@@ -32,7 +32,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from .errors import message
-from .trajectories import first_trajectories
+from .trajectories import first_trajectories, next_key
 
 Summary = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 
@@ -217,8 +217,8 @@ class SummaryStatistics(TensorDictModuleBase):
 
     Raises:
         TypeError: For what is not a function.
-        ValueError: For no functions; in a call, for discrete actions given as indices, no step, or
-            no batch size.
+        ValueError: For no functions; in a call, for discrete actions given as indices, no step, no
+            batch size, or observations that are no vectors.
         KeyError: In a call, for a missing entry.
 
     Example:
@@ -248,7 +248,7 @@ class SummaryStatistics(TensorDictModuleBase):
         self.functions, self.angles = functions, tuple(angles)
         self.observation_key, self.action_key = observation_key, action_key
         self.theta_key, self.one_hot = theta_key, one_hot
-        self.in_keys = [observation_key, action_key, _next(observation_key), ("next", "done")]
+        self.in_keys = [observation_key, action_key, next_key(observation_key), ("next", "done")]
         self.out_keys = [out_key]
 
     def together(self, trajectories: TensorDictBase) -> Tensor:
@@ -272,7 +272,7 @@ class SummaryStatistics(TensorDictModuleBase):
         # steps that do not count go to the end, as in any padded trajectory
         order = (~mask.flatten(-2)).long().argsort(dim=-1, stable=True)
         steps = TensorDict({"mask": mask.flatten(-2).gather(-1, order)}, order.shape)
-        for key in (self.observation_key, self.action_key, _next(self.observation_key)):
+        for key in (self.observation_key, self.action_key, next_key(self.observation_key)):
             values = trajectories.get(key).flatten(-3, -2)
             rows = order.unsqueeze(-1).expand(values.shape)
             steps.set(key, values.gather(-2, rows))
@@ -302,7 +302,11 @@ class SummaryStatistics(TensorDictModuleBase):
         """Return the values of all functions, or of those that are ``ordered`` or not."""
         _check_entries(tensordict, self.in_keys[:3])
         state, mask = _float(tensordict.get(self.observation_key)), tensordict.get("mask")
-        following = _float(tensordict.get(_next(self.observation_key)))
+        if state.ndim != mask.ndim + 1:
+            expected = f"vectors in {self.observation_key!r}, shape (*, T, D)"
+            hint = "FlattenObservation(-2, -1) for matrices, CatTensors for several entries"
+            raise ValueError(message(expected, tuple(state.shape), hint=hint))
+        following = _float(tensordict.get(next_key(self.observation_key)))
         if any(not -state.shape[-1] <= column < state.shape[-1] for column in self.angles):
             columns = f"angles among the {state.shape[-1]} columns of {self.observation_key!r}"
             raise ValueError(message(columns, self.angles))
@@ -374,7 +378,3 @@ def _float(values: Tensor) -> Tensor:
 
 def _is_ordered(function: Summary) -> bool:
     return getattr(function, "ordered", False)
-
-
-def _next(key: NestedKey) -> NestedKey:
-    return ("next", key) if isinstance(key, str) else ("next", *key)

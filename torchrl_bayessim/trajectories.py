@@ -7,12 +7,12 @@ Rows may differ in length; what stands behind a row's end is never read.
 
 from __future__ import annotations
 
-__all__ = ["concatenate", "first_trajectories", "pad", "returns"]
+__all__ = ["concatenate", "first_trajectories", "next_key", "pad", "returns"]
 
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
 from .errors import message
@@ -74,6 +74,16 @@ def pad(trajectories: Sequence[TensorDictBase]) -> TensorDictBase:
         index = torch.arange(longest).clamp_max(len(row) - 1)
         rows.append(row[index].set("mask", torch.arange(longest) < len(row)))
     return TensorDict.stack(rows)  # pyright: ignore[reportReturnType]
+
+
+def next_key(key: NestedKey) -> NestedKey:
+    """Return where a rollout keeps the same entry one step later.
+
+    Example:
+        >>> next_key("observation"), next_key(("arm", "angle"))
+        (('next', 'observation'), ('next', 'arm', 'angle'))
+    """
+    return ("next", key) if isinstance(key, str) else ("next", *key)
 
 
 def returns(trajectories: TensorDictBase) -> Tensor:

@@ -126,11 +126,12 @@ def test_simulations_that_diverge_are_dropped_counted_and_warned_about():
     def simulate(theta):
         return torch.where(theta[:, :1] > 0.5, torch.nan, inside(theta))
 
-    made, asked = refinement(), []
-    with pytest.warns(UserWarning, match=r"\d+ of 300 simulations are not finite: left out"):
+    made, asked = refinement(networks=2), []
+    with pytest.warns(UserWarning, match=r"\d+ of 300 simulations are not finite") as warned:
         report = made.refine(
             lambda theta: asked.append(theta) or simulate(theta), torch.zeros(4), key=(0,)
         )
+    assert len([w for w in warned if "not finite" in str(w.message)]) == 1  # of two networks
     assert report.dropped == (asked[0][:, 0] > 0.5).sum()
     assert report.pairs == 300 - report.dropped
 

@@ -182,6 +182,29 @@ def test_simulations_that_diverge_are_left_out_and_counted():
     assert only.fit.pairs == 400 - only.fit.dropped
 
 
+def test_counts_are_summaries_too():
+    """Contacts, resets and encoder ticks are whole numbers."""
+    counted = sequential(
+        lambda theta: (100 * theta).round().long(),
+        BOX,
+        torch.tensor([[50]]),
+        rounds=1,
+        simulations=100,
+        **QUICK,
+    )
+    floating = sequential(
+        lambda theta: (100 * theta).round(),
+        BOX,
+        torch.tensor([[50.0]]),
+        rounds=1,
+        simulations=100,
+        **QUICK,
+    )
+    theta = torch.linspace(-1.9, 1.9, 5)[:, None]
+    (one,), (other,) = counted, floating
+    assert torch.equal(one.posterior.log_prob(theta), other.posterior.log_prob(theta))
+
+
 def test_the_analytic_correction_trains_on_the_last_round_alone():
     *_, last = sequential(
         square(0), BOX, OBSERVED, rounds=2, simulations=300, correction="analytic", **QUICK

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 __all__ = ["PosteriorMaker", "average", "learn", "pairs_of"]
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -17,7 +19,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ..errors import message
-from .fit import FitReport, fit
+from .fit import FitReport, fit, usable_pairs
 from .physics_posterior import PhysicsPosterior
 from .posterior import MixtureDensityPosterior
 from .priors import Prior
@@ -45,12 +47,17 @@ def learn(
         seeds: Of the fits, one for each network.
         fit_options: Passed to :func:`.fit.fit`; a seed there takes the place of those above.
     """
+    pairs, dropped = usable_pairs(pairs)
+    if dropped:  # once, not once for each network
+        text = f"{dropped} of {dropped + len(pairs)} simulations are not finite: left out"
+        warnings.warn(text, stacklevel=3)
+    observed = observed.to(pairs["summary"])
     reports, members = [], []
     for seed in seeds:
         network = make_posterior(prior, pairs["summary"].shape[-1])
         reports.append(fit(network, pairs, **{"seed": seed, **fit_options}))
         members.append(network.condition(observed, check=False).mixture)
-    return PhysicsPosterior(average(members), prior), reports[0]
+    return PhysicsPosterior(average(members), prior), replace(reports[0], dropped=dropped)
 
 
 def pairs_of(theta: Tensor, summary: Tensor) -> TensorDict:
@@ -66,6 +73,8 @@ def pairs_of(theta: Tensor, summary: Tensor) -> TensorDict:
     got = tuple(summary.shape) if isinstance(summary, Tensor) else type(summary).__name__
     if not isinstance(got, tuple) or len(got) != 2 or got[0] != len(theta):
         raise ValueError(message(f"one summary per simulation, shape ({len(theta)}, L)", got))
+    # counts are statistics too
+    summary = summary if summary.is_floating_point() else summary.to(theta.dtype)
     return TensorDict({"theta": theta, "summary": summary}, batch_size=[len(theta)])
 
 
