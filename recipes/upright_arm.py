@@ -28,8 +28,8 @@ from torchrl_bayessim.logs.read import read_logs
 from torchrl_bayessim.logs.system import System
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
 from torchrl_bayessim.randomness import isolated, seed_from
+from torchrl_bayessim.replay_actions import ReplayActions
 from torchrl_bayessim.robots import SurrogateRobot
-from torchrl_bayessim.simulate import ReplayActions
 from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.transforms import ApplyEffect, ApplyPhysics, DomainRandomizer
 

@@ -20,6 +20,7 @@ LAYERS = [
         "physics",
         "envs",
         "evaluation",
+        "replay_actions",
     },
     {"summaries", "episode_draws", "remote_source", "inference", "agents", "replay", "effects"},
     {"logs"},

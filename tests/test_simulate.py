@@ -16,8 +16,8 @@ from torchrl_bayessim.errors import PhysicsError, SimulationError
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.physics.attributes import AttributePhysics
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
+from torchrl_bayessim.replay_actions import ReplayActions
 from torchrl_bayessim.simulate import (
-    ReplayActions,
     collect_summaries,
     make_collector,
     next_batch,

@@ -21,7 +21,8 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from .errors import message
-from .simulate import ReplayActions, collect_summaries, make_collector
+from .replay_actions import ReplayActions
+from .simulate import collect_summaries, make_collector
 from .summaries import SummaryStatistics
 from .trajectories import first_trajectories
 from .transforms.domain_randomizer import DomainRandomizer

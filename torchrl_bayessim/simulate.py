@@ -2,18 +2,18 @@ r"""Pairs of parameters and summaries, through a TorchRL collector.
 
 :math:`\theta` comes from a source, :math:`x \sim p(x \mid \theta)` from episodes under a
 policy. The statistics depend on the policy, so the policy that made the real data is an argument
-here; for recorded data, :class:`ReplayActions` repeats the recorded actions.
+here; for recorded data, :class:`.replay_actions.ReplayActions` repeats the recorded actions.
 """
 
 from __future__ import annotations
 
-__all__ = ["ReplayActions", "collect_summaries", "make_collector", "next_batch", "simulate"]
+__all__ = ["collect_summaries", "make_collector", "next_batch", "simulate", "summaries_in_turn"]
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import BaseCollector, Collector
@@ -27,59 +27,6 @@ from .sources import Grid, draw
 from .summaries import SummaryStatistics
 from .trajectories import concatenate, first_trajectories
 from .transforms.domain_randomizer import DomainRandomizer
-
-
-class ReplayActions(TensorDictModuleBase):
-    """A policy that plays recorded actions: environment i plays row ``i mod n`` at every step.
-
-    Args:
-        actions: Recorded actions, shape ``(n, T, A)``; after the last step the last one is held.
-        step_key: Entry that counts the steps of the episode (``StepCounter``'s).
-        action_key: Entry that is written.
-
-    Raises:
-        ValueError: For actions of another shape, or that are not finite; in a call, if nothing
-            counts the steps.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> replay = ReplayActions(torch.tensor([[[0.1], [0.2]]]))
-        >>> replay(TensorDict({"step_count": torch.tensor([[1], [0]])}, [2]))["action"].flatten()
-        tensor([0.2000, 0.1000])
-    """
-
-    actions: Tensor
-
-    def __init__(
-        self,
-        actions: Tensor,
-        *,
-        step_key: NestedKey = "step_count",
-        action_key: NestedKey = "action",
-    ) -> None:
-        super().__init__()
-        if actions.ndim != 3 or not actions.numel():
-            raise ValueError(message("actions of shape (n, T, A)", tuple(actions.shape)))
-        if not actions.isfinite().all():
-            raise ValueError(message("finite recorded actions", "NaN or infinity"))
-        self.register_buffer("actions", actions)
-        self.in_keys, self.out_keys = [step_key], [action_key]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action of each environment's current step."""
-        step = tensordict.get(self.in_keys[0], None)
-        if step is None:
-            raise ValueError(
-                message(
-                    f"steps of the episode counted in {self.in_keys[0]!r}",
-                    "no such entry",
-                    hint="a StepCounter among the environment's transforms",
-                )
-            )
-        step = step.reshape(tensordict.batch_size)
-        rows = torch.arange(step.numel(), device=step.device).reshape(step.shape)
-        step = step.clamp(max=self.actions.shape[1] - 1)
-        return tensordict.set(self.out_keys[0], self.actions[rows % len(self.actions), step])
 
 
 def make_collector(env: EnvBase, policy: TensorDictModuleBase | None, *, steps: int) -> Collector:
@@ -118,6 +65,62 @@ def next_batch(collector: BaseCollector) -> Any:
         ) from error
 
 
+def summaries_in_turn(
+    collector: BaseCollector,
+    statistics: SummaryStatistics,
+    randomizer: DomainRandomizer,
+    theta: Tensor,
+    *,
+    trajectories: int = 1,
+    key: tuple[int | str, ...],
+    prepare: Callable[[TensorDictBase], TensorDictBase] = first_trajectories,
+    first: int = 0,
+) -> Iterator[tuple[Tensor, TensorDictBase]]:
+    """Yield, batch after batch, the summaries that it completes, ``(n, L)``, and the batch.
+
+    What a batch holds depends on ``key``, on its number and on its parameters, and on nothing that
+    was simulated before: batches may be simulated anywhere, in any order.
+
+    Args:
+        collector: See :func:`collect_summaries`, as for all others.
+        statistics: Summaries.
+        randomizer: Has its source back afterwards.
+        theta: Parameters to simulate, shape ``(N, D)``; memory-mapped ones are read in parts.
+        trajectories: Number n of trajectories per pair.
+        key: What the simulations are for.
+        prepare: Gives a batch its ``"mask"``.
+        first: Number of the first batch.
+    """
+    source = randomizer.source
+    count = len(theta) * trajectories
+    width = getattr(collector, "n_env", count)
+    waiting: list[TensorDictBase] = []  # rows of a parameter vector that is not complete yet
+    done, index = 0, first
+    try:
+        while done < count:
+            rows = _rows(theta, trajectories, done, min(count, done + width))
+            randomizer.source = Grid(rows)
+            with isolated(*key, index):
+                collector.set_seed(seed_from(*key, index, "env") % 2**31)
+                collector.reset()
+                batch = next_batch(collector)
+            batch = batch.reshape(-1, batch.shape[-1])
+            _check_held(batch.get(randomizer.key, None), rows)
+            new: Any = prepare(batch)[: count - done]
+            new = new.select(*statistics.in_keys, "mask")
+            done, index = done + len(new), index + 1
+            ready: Any = concatenate([*waiting, new.clone()])
+            whole = len(ready) // trajectories
+            waiting = [ready[whole * trajectories :]]
+            if whole:
+                groups = ready[: whole * trajectories].unflatten(0, (whole, trajectories))
+                yield statistics.together(groups), batch
+            else:
+                yield torch.empty(0), batch
+    finally:
+        randomizer.source = source
+
+
 def collect_summaries(
     collector: BaseCollector,
     statistics: SummaryStatistics,
@@ -127,6 +130,7 @@ def collect_summaries(
     trajectories: int = 1,
     key: tuple[int | str, ...],
     prepare: Callable[[TensorDictBase], TensorDictBase] = first_trajectories,
+    first: int = 0,
     keep: int = 0,
     progress: bool = True,
 ) -> tuple[Tensor, list[TensorDictBase]]:
@@ -144,6 +148,7 @@ def collect_summaries(
         trajectories: Number n of trajectories per pair: as many as the robot ran.
         key: What the simulations are for: same key, same summaries (for a direct collector).
         prepare: Gives a batch its ``"mask"``.
+        first: Number of the first batch, for a part of what a key is for.
         keep: Number of batches to return.
         progress: Whether to show a progress bar.
 
@@ -153,38 +158,27 @@ def collect_summaries(
     Raises:
         PhysicsError: The batches were not simulated at ``theta``.
     """
-    source = randomizer.source
-    rows = theta.repeat_interleave(trajectories, 0)
     found: list[Tensor] = []
     kept: list[TensorDictBase] = []
-    waiting: list[TensorDictBase] = []  # rows of a parameter vector that is not complete yet
-    done, index = 0, 0
-    bar = tqdm(total=len(theta), desc="simulate", disable=not progress, leave=False, unit="pair")
-    try:
-        while done < len(rows):
-            randomizer.source = Grid(rows[done:])
-            with isolated(*key, index):
-                collector.set_seed(seed_from(*key, index, "env") % 2**31)
-                collector.reset()
-                batch = next_batch(collector)
-            batch = batch.reshape(-1, batch.shape[-1])
-            _check_held(batch.get(randomizer.key, None), rows[done:])
-            if index < keep:
+    options: dict[str, Any] = {"trajectories": trajectories, "key": key, "prepare": prepare}
+    turns = summaries_in_turn(collector, statistics, randomizer, theta, first=first, **options)
+    with tqdm(
+        total=len(theta), desc="simulate", disable=not progress, leave=False, unit="pair"
+    ) as bar:
+        for summaries, batch in turns:
+            if len(kept) < keep:
                 kept.append(batch.clone())
-            new: Any = prepare(batch)[: len(rows) - done]
-            new = new.select(*statistics.in_keys, "mask")
-            done, index = done + len(new), index + 1
-            ready: Any = concatenate([*waiting, new.clone()])
-            whole = len(ready) // trajectories
-            waiting = [ready[whole * trajectories :]]
-            if whole:
-                groups = ready[: whole * trajectories].unflatten(0, (whole, trajectories))
-                found.append(statistics.together(groups))
-            bar.update(done // trajectories - bar.n)
-    finally:
-        randomizer.source = source
-        bar.close()
+            if len(summaries):
+                found.append(summaries)
+            bar.update(len(summaries))
     return torch.cat(found), kept
+
+
+def _rows(theta: Tensor, trajectories: int, start: int, stop: int) -> Tensor:
+    """Return the parameters of trajectories ``start`` to ``stop``, without reading the others."""
+    first, last = start // trajectories, -(-stop // trajectories)
+    rows = theta[first:last].repeat_interleave(trajectories, 0)
+    return rows[start - first * trajectories : stop - first * trajectories]
 
 
 def _check_held(theta: Tensor | None, rows: Tensor) -> None:
