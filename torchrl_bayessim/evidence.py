@@ -10,7 +10,7 @@ from __future__ import annotations
 __all__ = ["Evidence", "EvidenceSimulator"]
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, TypedDict
 
 import torch
@@ -21,8 +21,10 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from .errors import message
+from .randomness import isolated, seed_from
+from .ray_collectors import RayCollectors
 from .replay_actions import ReplayActions
-from .simulate import collect_summaries, make_collector
+from .simulate import collect_summaries, make_collector, next_batch
 from .summaries import SummaryStatistics
 from .trajectories import first_trajectories
 from .transforms.domain_randomizer import DomainRandomizer
@@ -52,7 +54,11 @@ class EvidenceSimulator:
         randomizer: The transform of ``env`` that draws the parameters.
         horizon: Steps of the trajectories that are summarised.
         keep: Batches simulated under the present policy that are handed on.
+        collectors: On Ray, in the place of one in this process.
         progress: Whether to show progress bars.
+
+    Raises:
+        ValueError: The collectors have another number of environments.
     """
 
     def __init__(
@@ -64,16 +70,36 @@ class EvidenceSimulator:
         *,
         horizon: int,
         keep: int = 0,
+        collectors: RayCollectors | None = None,
         progress: bool = True,
     ) -> None:
-        self.env, self.policy = env, policy
+        if collectors is not None:
+            collectors.check(env, steps=horizon)
+        self.env, self.policy, self.collectors = env, policy, collectors
         self.statistics, self.randomizer = statistics, randomizer
         self.horizon, self.keep, self.progress = horizon, keep, progress
         self._collector: Collector | None = None
 
+    def begin(self, key: tuple[int | str, ...]) -> None:
+        """Begin new episodes, for the training batches that follow."""
+        if self.collectors is not None:
+            self.collectors.begin(self.randomizer, key=key)
+            return
+        with isolated(*key, "reset"):
+            self.collector.set_seed(seed_from(*key, "env") % 2**31)
+            self.collector.reset()
+
+    def batch(self, key: tuple[int | str, ...]) -> TensorDictBase:
+        """Return the next training batch, ``[N, T]``, collected with the present policy."""
+        if self.collectors is not None:
+            return self.collectors.batch(self.policy)
+        with isolated(*key):
+            batch = next_batch(self.collector)
+        return batch.reshape(-1, batch.shape[-1])
+
     @property
     def collector(self) -> Collector:
-        """The collector of the present policy, for training too; made on first use."""
+        """The collector of the present policy in this process; made on first use."""
         if self._collector is None:
             # a new collector resets the environments: an episode that a resumed run has on top
             begun = self.randomizer.get_extra_state()
@@ -97,15 +123,12 @@ class EvidenceSimulator:
         parts = []
         for index, entry in enumerate(evidence[:-1]):
             parts.append(self.earlier(entry, theta, key=(*key, index)))
-        last, batches = collect_summaries(
-            self.collector,
-            self.statistics,
-            self.randomizer,
+        last, batches = self._summaries(
+            self.policy,
             theta,
             trajectories=evidence[-1]["episodes"],
             key=(*key, len(evidence) - 1),
             keep=self.keep,
-            progress=self.progress,
         )
         return torch.cat([*parts, last], -1), batches
 
@@ -113,7 +136,7 @@ class EvidenceSimulator:
         """Return the summaries under an earlier policy, shape ``(N, L)``."""
         policy = copy.deepcopy(self.policy)
         policy.load_state_dict(entry["policy"])
-        return self._apart(policy, theta, trajectories=entry["episodes"], key=key)
+        return self._summaries(policy, theta, trajectories=entry["episodes"], key=key)[0]
 
     def replay(self, real: TensorDictBase, theta: Tensor, *, key: tuple[int | str, ...]) -> Tensor:
         """Return the summaries under recorded actions, shape ``(N, L)``.
@@ -135,35 +158,28 @@ class EvidenceSimulator:
             batch = first_trajectories(batch.reshape(-1, steps))
             return batch.set("mask", batch.get("mask") & cut)
 
-        key_of_actions = self.statistics.action_key
-        policy = ReplayActions(real.get(key_of_actions), action_key=key_of_actions)
-        return self._apart(
-            policy, theta, steps=steps, prepare=prepare, trajectories=len(real), key=key
-        )
+        action = self.statistics.action_key
+        return self._summaries(
+            ReplayActions(real.get(action), action_key=action),
+            theta,
+            steps=steps,
+            prepare=prepare,
+            trajectories=len(real),
+            key=key,
+        )[0]
 
-    def _apart(
-        self,
-        policy: TensorDictModuleBase,
-        theta: Tensor,
-        *,
-        trajectories: int,
-        key: tuple[int | str, ...],
-        steps: int | None = None,
-        prepare: Callable[[TensorDictBase], TensorDictBase] = first_trajectories,
-    ) -> Tensor:
-        """Simulate with a policy that is not the learner's present one."""
-        collector = make_collector(self.env, policy, steps=steps or self.horizon)
+    def _summaries(
+        self, policy: TensorDictModuleBase, theta: Tensor, *, steps: int | None = None, **asked: Any
+    ) -> tuple[Tensor, list[TensorDictBase]]:
+        """Return the summaries under a policy, and the batches to keep."""
+        steps = steps or self.horizon
+        asked["progress"] = self.progress
+        if self.collectors is not None:
+            return self.collectors.summaries(policy, self.statistics, theta, steps=steps, **asked)
+        present = policy is self.policy
+        collector = self.collector if present else make_collector(self.env, policy, steps=steps)
         try:
-            summaries, _ = collect_summaries(
-                collector,
-                self.statistics,
-                self.randomizer,
-                theta,
-                trajectories=trajectories,
-                key=key,
-                prepare=prepare,
-                progress=self.progress,
-            )
+            return collect_summaries(collector, self.statistics, self.randomizer, theta, **asked)
         finally:
-            collector.shutdown(close_env=False)
-        return summaries
+            if not present:
+                collector.shutdown(close_env=False)

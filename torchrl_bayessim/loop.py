@@ -39,9 +39,8 @@ from .evidence import Evidence, EvidenceSimulator
 from .inference.fit import FitReport
 from .inference.physics_posterior import PhysicsPosterior
 from .inference.refinement import PosteriorRefinement
-from .randomness import isolated, seed_from
+from .ray_collectors import RayCollectors
 from .robots import RealSystem, comparable
-from .simulate import next_batch
 from .sources import Defensive
 from .summaries import SummaryStatistics
 from .trajectories import concatenate, next_key
@@ -122,6 +121,8 @@ class SimToRealLoop:
         seed: Same seed, same rounds.
         checkpoint_file: Written after every step of the loop; :meth:`resume` goes on from it.
         checkpoint_every: Updates between two checkpoints. Episodes begin anew after each.
+        collectors: On Ray, to simulate there with as many environments as ``env`` has, which then
+            only tells what is simulated. The caller shuts them down.
         progress: Whether to show progress bars.
 
     Raises:
@@ -155,6 +156,7 @@ class SimToRealLoop:
         seed: int = 0,
         checkpoint_file: str | Path | None = None,
         checkpoint_every: int = 8,
+        collectors: RayCollectors | None = None,
         progress: bool = True,
     ) -> None:
         self.settings: dict[str, Any] = {
@@ -177,6 +179,8 @@ class SimToRealLoop:
             "seed": seed,
             "statistics": repr(statistics),
         }
+        if collectors is not None:  # whose noise depends on their number
+            self.settings["workers"] = collectors.workers
         for part, owner in {"refinement": refinement, "learner": learner, "robot": robot}.items():
             settings: dict[str, Any] = getattr(owner, "settings", {})
             self.settings |= {f"{part}.{name}": value for name, value in settings.items()}
@@ -195,6 +199,7 @@ class SimToRealLoop:
             randomizer,
             horizon=horizon,
             keep=shared_batches,
+            collectors=collectors,
             progress=progress,
         )
 
@@ -303,15 +308,10 @@ class SimToRealLoop:
         first = state["update"]
         last = min(first + self.checkpoint_every, self.updates)
         key = (self.seed, "round", state["round"], "train", first)
-        collector = self._simulator.collector
-        with isolated(*key, "reset"):
-            collector.set_seed(seed_from(*key, "env") % 2**31)
-            collector.reset()
+        self._simulator.begin(key)
         label = f"round {state['round'] + 1} of {self.rounds}: train"
         for update in tqdm(range(first, last), desc=label, disable=not self.progress, leave=False):
-            with isolated(*key, update):
-                batch = next_batch(collector)
-            self._update(batch.reshape(-1, batch.shape[-1]))
+            self._update(self._simulator.batch((*key, update)))
         state["update"] = last
 
     def _update(self, batch: TensorDictBase) -> None:

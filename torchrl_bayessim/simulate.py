@@ -10,7 +10,7 @@ from __future__ import annotations
 __all__ = ["collect_summaries", "make_collector", "next_batch", "simulate", "summaries_in_turn"]
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -27,6 +27,9 @@ from .sources import Grid, draw
 from .summaries import SummaryStatistics
 from .trajectories import concatenate, first_trajectories
 from .transforms.domain_randomizer import DomainRandomizer
+
+if TYPE_CHECKING:
+    from .ray_collectors import RayCollectors
 
 
 def make_collector(env: EnvBase, policy: TensorDictModuleBase | None, *, steps: int) -> Collector:
@@ -205,6 +208,7 @@ def simulate(
     max_steps: int,
     trajectories: int = 1,
     seed: int = 0,
+    collectors: RayCollectors | None = None,
     progress: bool = True,
 ) -> TensorDictBase:
     """Simulate pairs ``{"theta", "summary"}`` of batch size ``[pairs]``.
@@ -218,7 +222,11 @@ def simulate(
         max_steps: Steps after which a trajectory is cut.
         trajectories: Number of trajectories per pair, which are summarised together.
         seed: Same seed, same pairs.
+        collectors: On Ray, to simulate there: the same pairs.
         progress: Whether to show a progress bar.
+
+    Raises:
+        ValueError: A count is not positive, or the collectors have other environments.
 
     Example:
         >>> from torchrl.envs import Compose, TransformedEnv
@@ -238,18 +246,15 @@ def simulate(
     for name, value in counts.items():
         if value < 1:
             raise ValueError(message(f"{name} to be positive", value))
-    collector = make_collector(env, policy, steps=max_steps)
     theta = draw(randomizer.source, pairs, key=(seed, "theta"))  # pyright: ignore[reportArgumentType]
-    try:
-        summaries, _ = collect_summaries(
-            collector,
-            statistics,
-            randomizer,
-            theta,
-            trajectories=trajectories,
-            key=(seed,),
-            progress=progress,
-        )
-    finally:
-        collector.shutdown(close_env=False)
+    asked: dict[str, Any] = {"trajectories": trajectories, "key": (seed,), "progress": progress}
+    if collectors is not None:
+        collectors.check(env)
+        summaries, _ = collectors.summaries(policy, statistics, theta, steps=max_steps, **asked)
+    else:
+        collector = make_collector(env, policy, steps=max_steps)
+        try:
+            summaries, _ = collect_summaries(collector, statistics, randomizer, theta, **asked)
+        finally:
+            collector.shutdown(close_env=False)
     return TensorDict({"theta": theta, "summary": summaries}, batch_size=[pairs])

@@ -1,0 +1,251 @@
+"""Collectors on Ray: simulations on other cores and machines, through TorchRL's `RayCollector`.
+
+A worker that dies is begun anew by Ray and asked again, with the same answer.
+
+For inference, a worker simulates whole batches, each under its own key, as one process does, and
+sends their summaries: the pairs are those of one process, whichever worker simulates which batch.
+For training, each steps its share of the environments. θ is drawn by an environment's number among
+all of them, as in one process; actions and initial states have noise of their own.
+"""
+
+from __future__ import annotations
+
+__all__ = ["RayCollectors"]
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from importlib.util import find_spec
+from typing import Any, Self
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from tqdm.auto import tqdm
+
+from .diverged import UndisturbedPolicy
+from .errors import SimulationError, message
+from .ray_worker import Block, Inference, RayWorker
+from .summaries import SummaryStatistics
+from .trajectories import concatenate, first_trajectories
+from .transforms.domain_randomizer import DomainRandomizer
+
+_CLUSTER = {"include_dashboard": False, "logging_level": "warning"}
+_WORKER = {"num_cpus": 1, "max_restarts": 10, "max_task_retries": 10}
+
+
+class RayCollectors:
+    """W workers on Ray that simulate for inference, and collect for a learner.
+
+    Without a running cluster one is begun on this machine; ``RAY_ADDRESS``, or ``ray.init`` before,
+    chooses another. The package, and what ``make`` needs, must be installed on its machines.
+
+    Args:
+        make: Number of environments to an environment of that batch size, with `ApplyPhysics` and
+            a `DomainRandomizer` among its transforms: the one of this process, too.
+        policy: The learner's; its weights are sent before every batch.
+        environments: Number N of environments; every worker holds N for inference, and N / W for
+            training.
+        steps: Steps T of a training batch ``[N, T]``.
+        workers: Their number W.
+        cluster: Options of ``ray.init``, for a cluster that is begun here.
+        worker: Options of ``ray.remote``, such as ``{"num_cpus": 1}``: what a worker needs. After
+            ``max_restarts`` deaths of a worker, or ``max_task_retries`` in one question, it fails.
+
+    Raises:
+        ImportError: Ray is not installed.
+        ValueError: W does not divide N, the cluster has too few processors, or an environment has
+            no randomizer.
+        SimulationError: In a call: a worker died too often. What a worker raises is raised here.
+
+    Example::
+
+        with RayCollectors(make, ppo.policy, environments=128, steps=128, workers=4) as collectors:
+            pairs = simulate(env, policy, statistics, randomizer, collectors=collectors, ...)
+            loop = SimToRealLoop(env, ppo, robot, collectors=collectors, ...)
+    """
+
+    def __init__(
+        self,
+        make: Callable[[int], EnvBase],
+        policy: TensorDictModuleBase,
+        *,
+        environments: int,
+        steps: int,
+        workers: int = 2,
+        cluster: dict[str, Any] | None = None,
+        worker: dict[str, Any] | None = None,
+    ) -> None:
+        if find_spec("ray") is None:
+            hint = 'pip install "torchrl_bayessim[ray]"'
+            raise ImportError(message("the package ray", "none", hint=hint))
+        if workers < 1 or environments % workers:
+            expected = f"a number of workers that divides the {environments} environments"
+            raise ValueError(message(expected, workers))
+        from torchrl.collectors.distributed import RayCollector
+
+        self.environments, self.steps, self.workers = environments, steps, workers
+        needs = _WORKER | (worker or {})
+        self._block: tuple[Any, DomainRandomizer] | None = None
+        self._own = not self._ray.is_initialized()
+        if self._own:
+            self._ray.init(**(_CLUSTER | (cluster or {})))
+        self._check_processors(needs["num_cpus"])
+        self._collector = RayCollector(
+            [partial(make, environments // workers)] * workers,
+            UndisturbedPolicy(policy),
+            collector_class=RayWorker,  # pyright: ignore[reportArgumentType]
+            collector_kwargs=[
+                {"whole": partial(make, environments), "auto_register_policy_transforms": False}
+                for _ in range(workers)
+            ],
+            frames_per_batch=environments * steps,
+            sync=True,
+            remote_configs=needs,
+            weight_sync_schemes={},  # weights come with the question, also to a worker begun anew
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.shutdown()
+
+    def shutdown(self) -> None:
+        """End the workers, and the cluster if it was begun here."""
+        self._collector.shutdown()
+        self._end_cluster()
+
+    def _end_cluster(self) -> None:
+        if self._own:
+            self._ray.shutdown()
+
+    def summaries_in_turn(
+        self,
+        policy: TensorDictModuleBase | None,
+        statistics: SummaryStatistics,
+        theta: Tensor,
+        *,
+        steps: int,
+        trajectories: int = 1,
+        key: tuple[int | str, ...],
+        prepare: Callable[[TensorDictBase], TensorDictBase] = first_trajectories,
+        keep: int = 0,
+    ) -> Iterator[tuple[Tensor, list[TensorDictBase]]]:
+        """Yield the summaries of simulations at ``theta``, in order, ``(n, L)``, and kept batches.
+
+        They are those of :func:`.simulate.collect_summaries` in one process.
+
+        Args:
+            policy: That made the real data; ``None`` for uniformly random actions.
+            statistics: Summaries.
+            theta: Parameters to simulate, shape ``(N, D)``.
+            steps: Steps of a trajectory.
+            trajectories: Number of trajectories per pair.
+            key: What the simulations are for.
+            prepare: Gives a batch its ``"mask"``.
+            keep: Number of batches to send back too.
+        """
+        asked = Inference(policy, statistics, trajectories, steps, key, prepare)
+        question = self._ray.put(asked)
+        batches = trajectories // math.gcd(self.environments, trajectories)  # end with a pair
+        pairs = batches * self.environments // trajectories
+        shares = range(0, len(theta), pairs)
+        for turn in range(0, len(shares), self.workers):
+            asking = [
+                (question, theta[start : start + pairs], batches * number, keep)
+                for number, start in enumerate(shares[turn : turn + self.workers], turn)
+            ]
+            idle = [(None, theta[:0], 0, 0)] * (self.workers - len(asking))
+            yield from self._ask("summarise", asking + idle)[: len(asking)]
+
+    def summaries(
+        self,
+        policy: TensorDictModuleBase | None,
+        statistics: SummaryStatistics,
+        theta: Tensor,
+        *,
+        progress: bool = True,
+        **asked: Any,
+    ) -> tuple[Tensor, list[TensorDictBase]]:
+        """Return all of :meth:`summaries_in_turn` together, ``(N, L)``, and all kept batches."""
+        turns = self.summaries_in_turn(policy, statistics, theta, **asked)
+        options = {"total": len(theta), "desc": "simulate", "leave": False, "unit": "pair"}
+        found, batches = [], []
+        with tqdm(disable=not progress, **options) as bar:
+            for summaries, kept in turns:
+                found.append(summaries)
+                batches += kept
+                bar.update(len(summaries))
+        return torch.cat(found), batches
+
+    def check(self, env: EnvBase, *, steps: int | None = None) -> None:
+        """Refuse an environment of another size, or training batches of another length.
+
+        Raises:
+            ValueError: Pairs and batches would not be those of this environment.
+        """
+        got = (max(1, env.batch_size.numel()), steps or self.steps)
+        if got != (self.environments, self.steps):
+            expected = f"{self.environments} environments of {self.steps} steps, as on Ray"
+            raise ValueError(message(expected, f"{got[0]} of {got[1]}"))
+
+    def begin(self, randomizer: DomainRandomizer, *, key: tuple[int | str, ...]) -> None:
+        """Begin new episodes, with θ from the randomizer's source, for the batches that follow.
+
+        The randomizer counts the episodes, as it does for environments of this process.
+        """
+        state = randomizer.get_extra_state()
+        episodes = torch.zeros(self.environments, dtype=torch.int64)
+        known = state["episodes"][: self.environments]
+        episodes[: len(known)] = known
+        block = Block(randomizer.source, state["seed"], episodes, key)
+        self._block, self._weights = (self._ray.put(block), randomizer), []
+
+    def batch(self, policy: TensorDictModuleBase) -> TensorDictBase:
+        """Return the next batch ``[N, T]``, collected with the policy as it is now.
+
+        Raises:
+            RuntimeError: Nothing has begun.
+        """
+        if self._block is None:
+            raise RuntimeError(message("begin() before the first batch", "none"))
+        block, randomizer = self._block
+        self._weights.append(self._ray.put(dict(policy.state_dict())))
+        answers = self._ask("collect", [(block, list(self._weights))] * self.workers)
+        episodes = torch.cat([counted for _, counted in answers])
+        randomizer.set_extra_state({**randomizer.get_extra_state(), "episodes": episodes})
+        return concatenate([batch for batch, _ in answers])
+
+    @property
+    def _ray(self) -> Any:
+        import ray  # pyright: ignore[reportMissingImports]
+
+        return ray
+
+    def _check_processors(self, each: float) -> None:
+        """Refuse a cluster on which workers would wait for ever."""
+        there = self._ray.cluster_resources().get("CPU", 0)
+        if each * self.workers > there:
+            self._end_cluster()
+            expected = f"a cluster with {each * self.workers:g} processors for the workers"
+            hint = "fewer workers, or RAY_ADDRESS of a larger cluster"
+            raise ValueError(message(expected, f"{there:g}", hint=hint))
+
+    def _ask(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Return every worker's answer; Ray begins those anew that die, and asks them again."""
+        errors = self._ray.exceptions
+        try:
+            return self._collector.map_fn(method, list(arguments))
+        except errors.RayTaskError as error:
+            raise error.cause from error
+        except errors.RayActorError as error:
+            raise SimulationError(
+                message(
+                    "workers that live",
+                    f"one that died too often: {str(error).splitlines()[0]}",
+                    hint="is its memory enough? Does a simulator crash?",
+                )
+            ) from error

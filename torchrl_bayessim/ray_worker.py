@@ -1,0 +1,129 @@
+"""One worker of `RayCollectors`: a TorchRL collector in a process of Ray's.
+
+What it answers depends on nothing but the question, so that one which dies can be begun anew and
+asked again, with the same answer.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Block", "Inference", "RayWorker"]
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+
+from .errors import message
+from .randomness import isolated, seed_from
+from .simulate import collect_summaries, make_collector, next_batch
+from .summaries import SummaryStatistics
+from .transforms.domain_randomizer import DomainRandomizer, randomizers
+
+
+@dataclass(frozen=True)
+class Inference:
+    """What to simulate for inference."""
+
+    policy: TensorDictModuleBase | None
+    statistics: SummaryStatistics
+    trajectories: int
+    steps: int
+    key: tuple[int | str, ...]
+    prepare: Callable[[TensorDictBase], TensorDictBase]
+
+
+@dataclass(frozen=True)
+class Block:
+    """What training batches go on from: nothing that a worker keeps to itself."""
+
+    source: Any
+    seed: int
+    episodes: Tensor  # begun so far, of all environments
+    key: tuple[int | str, ...]
+
+
+class RayWorker(Collector):
+    """A collector of some environments, that simulates for inference with all of them."""
+
+    def __init__(
+        self, create_env_fn: Callable[[], EnvBase], *, whole: Callable[[], EnvBase], **options: Any
+    ) -> None:
+        torch.set_num_threads(1)
+        super().__init__(create_env_fn, **options)  # pyright: ignore[reportArgumentType]
+        self._make_whole, self._whole = whole, None
+        self._at: tuple[Any, int] | None = None  # block, and batches of it so far
+
+    def __bool__(self) -> bool:  # Ray asks before it sends an error; there is no length to tell
+        return True
+
+    def __repr__(self) -> str:  # which Ray prints before every line of a worker
+        return f"{type(self).__name__}({self.worker_idx})"
+
+    def summarise(
+        self, question: Inference | None, theta: Tensor, first: int, keep: int
+    ) -> tuple[Tensor, list[TensorDictBase]]:
+        """Return the summaries at ``theta``, the first batch of which has this number."""
+        if question is None:
+            return torch.empty(0), []
+        self._whole = self._whole or self._make_whole()
+        collector = make_collector(self._whole, question.policy, steps=question.steps)
+        try:
+            return collect_summaries(
+                collector,
+                question.statistics,
+                _randomizer(self._whole),
+                theta,
+                trajectories=question.trajectories,
+                key=question.key,
+                prepare=question.prepare,
+                first=first,
+                keep=max(0, keep - first),
+                progress=False,
+            )
+        finally:
+            collector.shutdown(close_env=False)
+
+    def collect(self, block: Block, weights: list[Any]) -> tuple[TensorDictBase, Tensor]:
+        """Return the batch of the last weights, and the episodes begun so far.
+
+        A worker that has not made the batches before it makes them again.
+        """
+        import ray  # pyright: ignore[reportMissingImports]
+
+        randomizer, before = _randomizer(self.env), len(weights) - 1
+        if self._at != (block.key, before):
+            self._restart(block, randomizer)
+            for step in range(before):
+                self._next(block, step, ray.get(weights[step]))
+        batch = self._next(block, before, ray.get(weights[-1]))
+        self._at = (block.key, len(weights))
+        return batch.reshape(-1, batch.shape[-1]), randomizer.get_extra_state()["episodes"]
+
+    def _next(self, block: Block, step: int, weights: dict[str, Any]) -> Any:
+        policy: Any = self.policy
+        policy.td_module.load_state_dict(weights)
+        with isolated(*block.key, "worker", self.worker_idx or 0, step):
+            return next_batch(self)
+
+    def _restart(self, block: Block, randomizer: DomainRandomizer) -> None:
+        worker, count = self.worker_idx or 0, self.n_env
+        randomizer.source = block.source
+        mine = block.episodes[worker * count : (worker + 1) * count]
+        randomizer.set_extra_state({"seed": block.seed, "episodes": mine})
+        with isolated(*block.key, "reset", worker):
+            self.set_seed(seed_from(*block.key, "env", worker) % 2**31)
+            self.reset()
+
+
+def _randomizer(env: EnvBase) -> DomainRandomizer:
+    """Return the randomizer of an environment."""
+    found = next(randomizers(env), None)
+    if found is None:
+        raise ValueError(message("a DomainRandomizer among the transforms of make(n)", "none"))
+    return found
