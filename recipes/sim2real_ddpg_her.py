@@ -14,11 +14,13 @@ checkpoints; ``resume=FOLDER`` goes on after a break.
 from __future__ import annotations
 
 import logging
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import recipe
+from collectors import collectors
 from fetch_tasks import FETCH, MEASURED, GoalTask, paper
 from rounds import Journal, compare, describe, draw_pictures, sentence, shown
 from scipy.stats import binomtest
@@ -58,6 +60,8 @@ class Sim2RealFetch(recipe.Settings):
     critic_sees_physics: bool = False
     preset: str = "fast"  # or "paper"
     baseline: bool = True  # also go on under the prior, with as many frames
+    collector: str = "direct"  # or "ray": the loop simulates in Ray's workers
+    workers: int = 2  # of Ray
     video: bool = True
     short: bool = False  # a smoke test: everything runs, little is learned
     resume: str = ""  # folder of a run that was broken off
@@ -76,7 +80,8 @@ def job(settings: Sim2RealFetch, out: Path) -> dict[str, Any]:
     resumed = run.loop.resume() if settings.resume else False
     if not resumed:  # otherwise the loop's checkpoint goes on from it
         run.hand_over()
-    rounds = run.rounds(score, Journal(out / "rounds.json", resume=resumed))
+    with run.collectors or nullcontext():
+        rounds = run.rounds(score, Journal(out / "rounds.json", resume=resumed))
     posterior = run.loop.refinement.posterior
     assert posterior is not None  # every round refines it
     after = score(run.learner.policy)
@@ -166,6 +171,8 @@ class Run:
         check_influence(self.env, self.randomizer, task.prior, steps=task.max_steps)
         self.learner: DDPG = task.learner(self.env, seed=seed)
         robot_env = task.make(settings.episodes, seed=seed, randomizer=None)
+        place = {"seed": seed, "workers": settings.workers}
+        self.collectors = collectors(settings.collector, task, self.learner.policy, **place)
         epochs = 40 if settings.short else 300
         self.loop = SimToRealLoop(
             self.env,
@@ -187,6 +194,7 @@ class Run:
             seed=seed,
             checkpoint_file=out / "checkpoint.pt",
             checkpoint_every=40,
+            collectors=self.collectors,
             progress=settings.progress,
         )
 

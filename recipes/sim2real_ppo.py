@@ -6,6 +6,7 @@ A surrogate robot has parameters that only the final score may see. Three rounds
 the policy; a posterior over its parameters is inferred from those episodes; PPO goes on under that
 posterior. The same PPO under the prior, with as many frames, is the baseline. Writes result.json,
 pictures, learning curves and a checkpoint; ``resume=FOLDER`` goes on after a break.
+``collector=ray`` simulates the loop on Ray, by default in two workers on this machine.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import shutil
+from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
 from multiprocessing import active_children
@@ -20,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import recipe
+from collectors import collectors
 from rounds import Journal, compare, confidence, describe, draw_pictures, sentence, shown
 from tasks import TASKS, Task, true_parameters
 from torch import Tensor
@@ -34,6 +37,7 @@ from torchrl_bayessim.inference.refinement import PosteriorRefinement
 from torchrl_bayessim.influence import without_influence
 from torchrl_bayessim.loop import SimToRealLoop, ended_return
 from torchrl_bayessim.randomness import isolated
+from torchrl_bayessim.ray_collectors import RayCollectors
 from torchrl_bayessim.robots import SurrogateRobot
 from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.summaries import SummaryStatistics
@@ -53,6 +57,8 @@ class Sim2Real(recipe.Settings):
     simulations: int = 1024  # pairs per round
     updates: int = 0  # PPO updates per round; 0 for the task's own number
     baseline: bool = True  # also train under the prior, with as many frames
+    collector: str = "direct"  # or "ray": the loop simulates in Ray's workers
+    workers: int = 2  # of Ray
     short: bool = False  # a smoke test: everything runs, little is learned
     logger: str = "csv"  # or tensorboard, wandb, mlflow
     resume: str = ""  # folder of a run that was broken off
@@ -70,13 +76,14 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
     shutil.rmtree(out / "log", ignore_errors=True)  # of a broken run, which is logged again
     logger = get_logger(settings.logger, logger_name=str(out), experiment_name="log")
 
-    loop, learner = make_loop(task, truth, settings, out)
+    loop, learner, there = make_loop(task, truth, settings, out)
     resumed = loop.resume() if settings.resume else False
     done = Journal(out / "rounds.json", resume=resumed, logger=logger)
     print(f"{settings.task}: {task.prior}")
     for name in idle(task):
         print(f"note: {name} changes nothing that is observed, so no data can tell it")
-    with Baseline(settings, frames=loop.planned_frames) as baseline:
+    planned = loop.planned_frames
+    with there or nullcontext(), Baseline(settings, frames=planned) as baseline:
         for turn in loop:
             earned = confidence(score(learner.policy))
             done.add(turn.index, describe(turn, task, truth, real=earned))
@@ -127,12 +134,14 @@ def chosen(settings: Sim2Real) -> Task:
 
 def make_loop(
     task: Task, truth: Tensor, settings: Sim2Real, out: Path
-) -> tuple[SimToRealLoop, PPO]:
-    """Return the loop and its learner."""
+) -> tuple[SimToRealLoop, PPO, RayCollectors | None]:
+    """Return the loop, its learner, and where it simulates if not here."""
     randomizer = DomainRandomizer(task.prior, seed=settings.seed)
     env = task.make(task.environments, seed=settings.seed, randomizer=randomizer)
     robot_env = task.make(settings.episodes, seed=settings.seed, randomizer=None)
     learner = PPO(env, seed=settings.seed, **task.ppo)
+    place = {"seed": settings.seed, "workers": settings.workers}
+    there = collectors(settings.collector, task, learner.policy, **place)
     loop = SimToRealLoop(
         env,
         learner,
@@ -152,9 +161,10 @@ def make_loop(
         rounds=settings.rounds,
         seed=settings.seed,
         checkpoint_file=out / "checkpoint.pt",
+        collectors=there,
         progress=settings.progress,
     )
-    return loop, learner
+    return loop, learner, there
 
 
 def idle(task: Task) -> tuple[str, ...]:

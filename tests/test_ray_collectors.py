@@ -1,7 +1,9 @@
 """Simulations on Ray: a cluster of two processors, begun here, whose workers are killed."""
 
+import json
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -212,6 +214,20 @@ def test_logs_are_replayed_on_ray_as_here(collectors):
     assert str(said(here)[0]) == str(said(there)[0])
 
 
+def test_a_recipe_simulates_on_ray(cluster, tmp_path):
+    recipe = Path(__file__).parent.parent / "recipes" / "sim2real_ppo.py"
+    short = ["short=true", "progress=false", "rounds=1", "episodes=2", "simulations=48"]
+    results = []
+    for kind in ("direct", "ray"):
+        given = [*short, "baseline=false", f"collector={kind}", f"out={tmp_path / kind}"]
+        command = [sys.executable, "-W", "ignore", str(recipe), *given]
+        subprocess.run(command, check=True, capture_output=True, timeout=120)
+        results.append(json.loads((tmp_path / kind / "result.json").read_text()))
+    for name in ("posterior_mean", "posterior_sd", "log_prob_true", "frames"):
+        here, there = (result["rounds"][0][name] for result in results)
+        assert here == there
+
+
 def test_what_a_worker_raises_is_raised_here(collectors):
     def wrong(state, action, following, mask):
         raise ArithmeticError("no such statistic")
@@ -224,9 +240,18 @@ def test_a_worker_that_always_dies_ends_the_run(cluster, tmp_path):
     mortal = {"max_restarts": 1, "max_task_retries": 1, "num_cpus": 0}
     policy = learner().policy
     made = RayCollectors(make, policy, environments=N, steps=STEPS, workers=1, worker=mortal)
-    with made, pytest.raises(SimulationError, match="workers that live, got 'one that died too"):
+    with made, pytest.raises(SimulationError, match="workers that begin and live, got 'The actor"):
         pairs(SummaryStatistics(Fatal(tmp_path, deaths=9)), collectors=made)
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_worker_that_cannot_begin_says_why(cluster):
+    def missing(environments):
+        raise ModuleNotFoundError("no simulator here")
+
+    policy, few = learner().policy, {"num_cpus": 0}
+    with pytest.raises(SimulationError, match="ModuleNotFoundError: no simulator here"):
+        RayCollectors(missing, policy, environments=N, steps=STEPS, workers=1, worker=few)
 
 
 def test_what_cannot_be_done_is_refused(cluster, collectors):

@@ -14,6 +14,7 @@ __all__ = ["RayCollectors"]
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, Self
@@ -58,7 +59,8 @@ class RayCollectors:
         ImportError: Ray is not installed.
         ValueError: W does not divide N, the cluster has too few processors, or an environment has
             no randomizer.
-        SimulationError: In a call: a worker died too often. What a worker raises is raised here.
+        SimulationError: A worker cannot begin or, in a call, died too often. What a worker raises
+            is raised here.
 
     Example::
 
@@ -93,19 +95,20 @@ class RayCollectors:
         if self._own:
             self._ray.init(**(_CLUSTER | (cluster or {})))
         self._check_processors(needs["num_cpus"])
-        self._collector = RayCollector(
-            [partial(make, environments // workers)] * workers,
-            UndisturbedPolicy(policy),
-            collector_class=RayWorker,  # pyright: ignore[reportArgumentType]
-            collector_kwargs=[
-                {"whole": partial(make, environments), "auto_register_policy_transforms": False}
-                for _ in range(workers)
-            ],
-            frames_per_batch=environments * steps,
-            sync=True,
-            remote_configs=needs,
-            weight_sync_schemes={},  # weights come with the question, also to a worker begun anew
-        )
+        with self._errors():
+            self._collector = RayCollector(
+                [partial(make, environments // workers)] * workers,
+                UndisturbedPolicy(policy),
+                collector_class=RayWorker,  # pyright: ignore[reportArgumentType]
+                collector_kwargs=[
+                    {"whole": partial(make, environments), "auto_register_policy_transforms": False}
+                    for _ in range(workers)
+                ],
+                frames_per_batch=environments * steps,
+                sync=True,
+                remote_configs=needs,
+                weight_sync_schemes={},  # a worker begun anew needs them with the question
+            )
 
     def __enter__(self) -> Self:
         return self
@@ -236,16 +239,24 @@ class RayCollectors:
 
     def _ask(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Return every worker's answer; Ray begins those anew that die, and asks them again."""
+        with self._errors():
+            return self._collector.map_fn(method, list(arguments))
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Raise what a worker raises, and say of one that has ended why."""
         errors = self._ray.exceptions
         try:
-            return self._collector.map_fn(method, list(arguments))
+            yield
         except errors.RayTaskError as error:
             raise error.cause from error
         except errors.RayActorError as error:
+            lines = str(error).strip().splitlines()
             raise SimulationError(
                 message(
-                    "workers that live",
-                    f"one that died too often: {str(error).splitlines()[0]}",
-                    hint="is its memory enough? Does a simulator crash?",
+                    "workers that begin and live",
+                    f"{lines[0]} {lines[-1]}",
+                    hint="is what make() needs installed there, and memory enough? Does a "
+                    "simulator crash?",
                 )
             ) from error

@@ -55,6 +55,7 @@ class RayWorker(Collector):
         self, create_env_fn: Callable[[], EnvBase], *, whole: Callable[[], EnvBase], **options: Any
     ) -> None:
         torch.set_num_threads(1)
+        self.number: int = options["worker_idx"]
         super().__init__(create_env_fn, **options)  # pyright: ignore[reportArgumentType]
         self._make_whole, self._whole = whole, None
         self._at: tuple[Any, int] | None = None  # block, and batches of it so far
@@ -63,7 +64,7 @@ class RayWorker(Collector):
         return True
 
     def __repr__(self) -> str:  # which Ray prints before every line of a worker
-        return f"{type(self).__name__}({self.worker_idx})"
+        return f"{type(self).__name__}({self.number})"
 
     def summarise(
         self, question: Inference | None, theta: Tensor, first: int, keep: int
@@ -108,11 +109,11 @@ class RayWorker(Collector):
     def _next(self, block: Block, step: int, weights: dict[str, Any]) -> Any:
         policy: Any = self.policy
         policy.td_module.load_state_dict(weights)
-        with isolated(*block.key, "worker", self.worker_idx or 0, step):
+        with isolated(*block.key, "worker", self.number, step):
             return next_batch(self)
 
     def _restart(self, block: Block, randomizer: DomainRandomizer) -> None:
-        worker, count = self.worker_idx or 0, self.n_env
+        worker, count = self.number, self.n_env
         randomizer.source = block.source
         mine = block.episodes[worker * count : (worker + 1) * count]
         randomizer.set_extra_state({"seed": block.seed, "episodes": mine})
