@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_bayessim.whole_file import replacing, write_text
+from torchrl_bayessim.whole_file import replacing, replacing_folder, write_text
 
 ENDS = f"import os; os.kill(os.getpid(), {int(signal.SIGKILL)})"
 HALF = """
@@ -106,3 +106,32 @@ def test_nothing_else_in_the_package_or_the_recipes_writes_a_file():
     found = {line for line in found if not line.startswith("recipes/withheld/plant_bullet.py:")}
     (only,) = found
     assert only.startswith("torchrl_bayessim/whole_file.py:")
+
+
+HALF_A_FOLDER = """
+import sys
+from torchrl_bayessim.whole_file import replacing_folder
+with replacing_folder(sys.argv[1]) as beside:
+    (beside / "file").write_text("half")
+    {ends}
+"""
+
+
+def test_a_folder_is_there_when_it_is_whole_and_replaces_none(tmp_path):
+    folder = tmp_path / "runs" / "pairs"
+    with suppress(ZeroDivisionError), replacing_folder(folder) as beside:
+        (beside / "file").write_text(str(1 // 0))
+    assert list(folder.parent.iterdir()) == []
+    command = [sys.executable, "-W", "ignore", "-c", HALF_A_FOLDER.format(ends=ENDS), str(folder)]
+    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    (left,) = folder.parent.iterdir()
+    assert left != folder
+    with replacing_folder(folder) as beside:
+        (beside / "file").write_text("whole")
+        assert not folder.exists()
+    assert list(folder.parent.iterdir()) == [folder]
+    assert (folder / "file").read_text() == "whole"
+    refused = pytest.raises(FileExistsError, match="a folder that does not exist yet")
+    with refused, replacing_folder(folder):
+        pass
+    assert (folder / "file").read_text() == "whole"

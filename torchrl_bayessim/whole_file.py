@@ -5,14 +5,17 @@ Whoever reads the target sees the old content or the new one, also after a kill 
 
 from __future__ import annotations
 
-__all__ = ["replacing", "write_text"]
+__all__ = ["replacing", "replacing_folder", "write_text"]
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from glob import escape
 from pathlib import Path
 from typing import BinaryIO
+
+from .errors import message
 
 
 @contextmanager
@@ -69,12 +72,60 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         file.write(text.encode())
 
 
+@contextmanager
+def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Make a folder beside ``path`` that becomes it when the block ends without an error.
+
+    Args:
+        path: The folder, which must not exist. What is left of a killed writer is removed.
+
+    Raises:
+        FileExistsError: There is such a folder, or file.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp()) / "pairs"
+        >>> with replacing_folder(folder) as beside:
+        ...     _ = (beside / "half").write_text("")
+        ...     folder.exists()
+        False
+        >>> [file.name for file in folder.iterdir()]
+        ['half']
+    """
+    path = Path(path).absolute()
+    if path.exists():
+        hint = "another folder; what is there is not written over"
+        raise FileExistsError(message("a folder that does not exist yet", str(path), hint=hint))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _sweep(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary.mkdir()
+    try:
+        yield temporary
+        for file in temporary.rglob("*"):
+            if file.is_file():
+                _sync(file)
+        temporary.rename(path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    _sync_folder(path.parent)
+
+
+def _sync(file: Path) -> None:
+    """Force a file to disk that others have written."""
+    with file.open("rb") as written:
+        os.fsync(written.fileno())
+
+
 def _sweep(path: Path) -> None:
     """Remove what killed writers of ``path`` left beside it."""
     for left in path.parent.glob(f".{escape(path.name)}.*.tmp"):
         writer = left.name.removesuffix(".tmp").rpartition(".")[2]
         if writer.isdecimal() and not _alive(int(writer)):
-            left.unlink(missing_ok=True)
+            if left.is_dir():
+                shutil.rmtree(left)
+            else:
+                left.unlink(missing_ok=True)
 
 
 def _alive(process: int) -> bool:
