@@ -50,7 +50,7 @@ def test_no_exploration(categorical):
 
 
 def test_bad_input_is_refused():
-    with pytest.raises(ValueError, match="max_steps of at least 1"):
+    with pytest.raises(ValueError, match="max_steps to be positive, got 0"):
         evaluate(CartPoleEnv(1), always(0, 2), max_steps=0)
 
 

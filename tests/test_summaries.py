@@ -204,7 +204,7 @@ def test_a_lag_beyond_the_trajectory_is_no_correlation():
 
 @pytest.mark.parametrize("lags", [(), (0,), (1, -2)])
 def test_lags_must_be_positive(lags):
-    with pytest.raises(ValueError, match="expected positive lags"):
+    with pytest.raises(ValueError, match=r"expected (positive lags|steps of a lag to be positive)"):
         autocorrelation(*lags)
 
 
@@ -244,7 +244,7 @@ def test_parameters_are_handed_on_under_their_own_key():
 
 
 def test_waypoints_must_be_some():
-    with pytest.raises(ValueError, match="a positive number of waypoints"):
+    with pytest.raises(ValueError, match="waypoints to be positive, got 0"):
         waypoints(0)
 
 

@@ -286,7 +286,7 @@ def test_a_worker_that_cannot_be_told_is_refused():
 
 def test_robots_and_intervals_that_do_not_fit_are_refused():
     _, _, randomizer = direct()
-    with pytest.raises(ValueError, match="an interval of at least 2, got 1"):
+    with pytest.raises(ValueError, match="at least 2 batches per interval, got 1"):
         PosteriorTrainerHook(
             Watched(), refinement=PosteriorRefinement(PRIOR), statistics=STATISTICS, interval=1
         )

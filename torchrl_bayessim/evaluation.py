@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from .counts import check_count
 from .errors import SimulationError, message
 
 
@@ -27,6 +28,7 @@ def evaluate(env: EnvBase, policy: TensorDictModuleBase, *, max_steps: int) -> T
         max_steps: Longest episode.
 
     Raises:
+        TypeError: ``max_steps`` is no whole number.
         ValueError: ``max_steps`` is not positive.
         SimulationError: A reward is not finite.
 
@@ -37,8 +39,7 @@ def evaluate(env: EnvBase, policy: TensorDictModuleBase, *, max_steps: int) -> T
         >>> evaluate(env, PPO(env).policy, max_steps=200).shape
         torch.Size([3])
     """
-    if max_steps < 1:
-        raise ValueError(message("max_steps of at least 1", max_steps))
+    check_count("max_steps", max_steps)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         tensordict = env.reset()
         total = torch.zeros(env.batch_size, device=env.device)
@@ -69,6 +70,7 @@ def successes(env: EnvBase, policy: TensorDictModuleBase, *, max_steps: int) -> 
         max_steps: Longest episode.
 
     Raises:
+        TypeError: ``max_steps`` is no whole number.
         ValueError: ``max_steps`` is not positive, or a reward is neither -1 nor 0.
 
     Example:
@@ -79,8 +81,7 @@ def successes(env: EnvBase, policy: TensorDictModuleBase, *, max_steps: int) -> 
         >>> successes(env, DDPG(env, goal_reward).policy, max_steps=50)
         tensor([False, False, False])
     """
-    if max_steps < 1:
-        raise ValueError(message("max_steps of at least 1", max_steps))
+    check_count("max_steps", max_steps)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         steps = env.rollout(max_steps, policy, break_when_any_done=False)
     first = steps["next", "done"].squeeze(-1).long().argmax(-1)  # 0 if none ended

@@ -24,6 +24,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .counts import check_count
 from .envs.task import Task
 from .errors import message
 from .physics.protocol import Physics
@@ -107,6 +108,7 @@ def excite(
         seed: Same seed, same experiment.
 
     Raises:
+        TypeError: For counts that are no whole numbers.
         ValueError: For counts that are not positive, or fewer than 2 knots.
 
     Example:
@@ -118,10 +120,8 @@ def excite(
     """
     counts = {"steps": steps, "candidates": candidates, "rounds": rounds}
     for name, value in counts.items():
-        if value < 1:
-            raise ValueError(message(f"{name} to be positive", value))
-    if knots < 2:
-        raise ValueError(message("at least 2 knots", knots))
+        check_count(name, value)
+    check_count("knots", knots, least=2)
     low, high = (torch.as_tensor(bound).double() for bound in bounds)
     g = generator(seed, "excitation")
     mean = torch.zeros(knots, len(low), dtype=torch.float64)

@@ -21,7 +21,6 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from operator import index
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -33,6 +32,7 @@ from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
 from . import checkpoint
+from .counts import check_count
 from .diverged import finite_rows
 from .errors import message
 from .evidence import Evidence, EvidenceSimulator
@@ -167,9 +167,9 @@ class SimToRealLoop:
             "environments": max(1, env.batch_size.numel()),
         }
         for name, value in self.settings.items():
-            _check_count(name, value, least=1)
+            check_count(name, value)
         for name, value in {"updates": updates, "shared_batches": shared_batches}.items():
-            _check_count(name, value, least=0)
+            check_count(name, value, least=0)
         if not 0 <= prior_share <= 1:
             raise ValueError(message("prior_share to be a probability, 0 to 1", prior_share))
         self.settings |= {
@@ -377,17 +377,6 @@ class SimToRealLoop:
 
 
 _FRESH: dict[str, Any] = {"real": None, "fit": None, "update": 0, "curve": [], "seconds": 0.0}
-
-
-def _check_count(name: str, value: Any, *, least: int) -> None:
-    """Refuse what is not a whole number of at least ``least``."""
-    try:
-        index(value)
-    except TypeError:
-        raise TypeError(message(f"a whole number of {name}", value)) from None
-    if value < least:
-        expected = f"{name} to be positive" if least else f"{name} not to be negative"
-        raise ValueError(message(expected, value))
 
 
 def ended_return(batch: TensorDictBase) -> float:

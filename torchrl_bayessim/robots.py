@@ -20,6 +20,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from .counts import check_count
 from .diverged import UndisturbedPolicy
 from .errors import SimulationError, message
 from .randomness import isolated, seed_from
@@ -61,7 +62,8 @@ class SurrogateRobot:
 
     Raises:
         SimulationError: In a call: what was measured is not finite.
-        TypeError: θ is not made of numbers, or ``measured`` is one name and no sequence.
+        TypeError: θ is not made of numbers, ``measured`` is one name and no sequence, or a count
+            is no whole number.
         ValueError: For a measured entry that is not observed, no steps, or an environment that
             draws its own parameters; in a call, for no episodes, or a policy that reads what is not
             measured.
@@ -87,8 +89,7 @@ class SurrogateRobot:
         max_steps: int,
         measured: Sequence[NestedKey] = ("observation",),
     ) -> None:
-        if max_steps < 1:
-            raise ValueError(message("max_steps to be positive", max_steps))
+        check_count("max_steps", max_steps)
         _check_not_randomized(env)
         _check_sequence(measured)
         self.max_steps, self.measured = max_steps, list(measured)
@@ -124,8 +125,7 @@ class SurrogateRobot:
         key: tuple[int | str, ...],
     ) -> TensorDictBase:
         """Return trajectories ``[episodes, T]`` with a ``"mask"``, made by ``policy``."""
-        if episodes < 1:
-            raise ValueError(message("episodes to be positive", episodes))
+        check_count("episodes", episodes)
         for entry in getattr(policy, "in_keys", ()):
             if entry in self._observed and entry not in self.measured:
                 raise ValueError(

@@ -20,6 +20,7 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
+from .counts import check_count
 from .diverged import UndisturbedPolicy
 from .errors import PhysicsError, SimulationError, message
 from .randomness import isolated, seed_from
@@ -226,6 +227,7 @@ def simulate(
         progress: Whether to show a progress bar.
 
     Raises:
+        TypeError: A count is no whole number.
         ValueError: A count is not positive, or the collectors have other environments.
 
     Example:
@@ -244,8 +246,7 @@ def simulate(
     """
     counts = {"pairs": pairs, "max_steps": max_steps, "trajectories": trajectories}
     for name, value in counts.items():
-        if value < 1:
-            raise ValueError(message(f"{name} to be positive", value))
+        check_count(name, value)
     theta = draw(randomizer.source, pairs, key=(seed, "theta"))  # pyright: ignore[reportArgumentType]
     asked: dict[str, Any] = {"trajectories": trajectories, "key": (seed,), "progress": progress}
     if collectors is not None:

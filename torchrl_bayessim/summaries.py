@@ -31,6 +31,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from .counts import check_count
 from .errors import message
 from .trajectories import first_trajectories, next_key
 
@@ -111,10 +112,13 @@ def autocorrelation(*lags: int) -> Summary:
     pairs of steps that both count. Frequencies and damping show here.
 
     Raises:
+        TypeError: For a lag that is no whole number.
         ValueError: For no lags, or lags that are not positive.
     """
-    if not lags or min(lags) < 1:
+    if not lags:
         raise ValueError(message("positive lags", lags, hint="autocorrelation(1, 2, 4, 8)"))
+    for lag in lags:
+        check_count("steps of a lag", lag)
 
     def summary(state: Tensor, action: Tensor, next_state: Tensor, mask: Tensor) -> Tensor:
         del action
@@ -137,10 +141,10 @@ def waypoints(count: int) -> Summary:
     """States at ``count`` moments spread evenly over each trajectory's own length; L = D count.
 
     Raises:
+        TypeError: If ``count`` is no whole number.
         ValueError: If ``count`` is not positive.
     """
-    if count < 1:
-        raise ValueError(message("a positive number of waypoints", count))
+    check_count("waypoints", count)
 
     def summary(state: Tensor, action: Tensor, next_state: Tensor, mask: Tensor) -> Tensor:
         del state, action

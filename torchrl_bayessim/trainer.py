@@ -24,6 +24,7 @@ from torchrl.collectors import BaseCollector, MultiAsyncCollector
 from torchrl.envs import EnvBase
 from torchrl.trainers import Trainer, TrainerHookBase
 
+from .counts import check_count
 from .errors import PhysicsError, message
 from .inference.fit import FitReport
 from .inference.refinement import PosteriorRefinement
@@ -55,9 +56,10 @@ class PosteriorTrainerHook(TrainerHookBase):
         seed: Same seed, same real episodes and fits.
 
     Raises:
-        ValueError: An interval below 2; at registration, a trainer whose batches do not begin with
-            a reset or may be made by several policies, or a randomizer that its collector does not
-            step.
+        TypeError: A count is no whole number.
+        ValueError: An interval below 2, or no episodes; at registration, a trainer whose batches do
+            not begin with a reset or may be made by several policies, or a randomizer that its
+            collector does not step.
         PhysicsError: The batch of the pairs was not drawn from where the posterior is learned.
         RuntimeError: The policy was changed while the batch of the pairs was collected.
 
@@ -110,10 +112,8 @@ class PosteriorTrainerHook(TrainerHookBase):
         prior_share: float = 0.1,
         seed: int = 0,
     ) -> None:
-        if interval < 2:
-            raise ValueError(
-                message("an interval of at least 2", interval, hint="between, training happens")
-            )
+        check_count("batches per interval", interval, least=2)
+        check_count("episodes", episodes)
         if robot.recorded:
             raise ValueError(
                 message("a robot that runs the policy", "recorded logs", hint="SimToRealLoop")

@@ -344,10 +344,11 @@ def test_weights_that_teach_nothing_are_refused(weight):
 
 @pytest.mark.parametrize("options", [{"epochs": 0}, {"batch_size": 0}])
 def test_epochs_and_batches_are_positive(options):
+    (name,) = options
     prior = BoxPrior({"a": (0.0, 1.0)})
     theta = prior.sample((8,), generator=generator(0))
     data = TensorDict({"theta": theta, "summary": theta}, [8])
-    with pytest.raises(ValueError, match="positive epochs and batch_size"):
+    with pytest.raises(ValueError, match=f"{name} to be positive, got 0"):
         fit(MixtureDensityPosterior(prior, 1), data, progress=False, **options)
 
 

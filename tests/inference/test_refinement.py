@@ -213,7 +213,7 @@ def test_a_robot_that_does_what_the_simulator_cannot_is_noticed(seed):
 
 def test_sizes_are_checked_at_construction():
     prior = BoxPrior({"a": (0.0, 1.0)})
-    with pytest.raises(ValueError, match="at least 4 simulations and 1 network"):
+    with pytest.raises(ValueError, match="at least 4 simulations, got 0"):
         PosteriorRefinement(prior, simulations=0)
-    with pytest.raises(ValueError, match="positive components and summary size"):
+    with pytest.raises(ValueError, match="components to be positive, got 0"):
         MixtureDensityPosterior(prior, 3, components=0)

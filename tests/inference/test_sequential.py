@@ -233,10 +233,18 @@ def test_an_unknown_correction_is_refused():
         next(rounds)
 
 
-@pytest.mark.parametrize("small", [{"rounds": 0}, {"simulations": 3}, {"networks": 0}], ids=str)
-def test_counts_that_are_too_small_are_refused(small):
+@pytest.mark.parametrize(
+    ("small", "text"),
+    [
+        ({"rounds": 0}, "rounds to be positive, got 0"),
+        ({"simulations": 3}, "at least 4 simulations, got 3"),
+        ({"networks": 0}, "networks to be positive, got 0"),
+    ],
+    ids=str,
+)
+def test_counts_that_are_too_small_are_refused(small, text):
     options = {"rounds": 1, "simulations": 9} | small
-    with pytest.raises(ValueError, match="at least 1 round, 4 simulations and 1 network, got"):
+    with pytest.raises(ValueError, match=text):
         next(sequential(square(0), BOX, OBSERVED, **options))
 
 

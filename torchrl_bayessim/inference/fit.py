@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import torch
 from tensordict import NestedKey, TensorDictBase
 
+from ..counts import check_count
 from ..errors import SimulationError, message
 from ..randomness import generator
 from .descent import descend
@@ -115,14 +116,14 @@ def fit(
         ValueError: For fewer than 4 usable pairs, shapes that do not match the posterior,
             parameters outside the prior, or a share that is not between 0 and 1.
         SimulationError: If no pair is finite, or the loss is not.
-        TypeError: The pairs are not a TensorDict.
+        TypeError: The pairs are not a TensorDict, or a count is no whole number.
     """
     if not isinstance(data, TensorDictBase):
         raise TypeError(message("pairs in a TensorDict of batch size (N,)", type(data).__name__))
     if not 0 < validation_fraction < 1:
         raise ValueError(message("a validation_fraction between 0 and 1", validation_fraction))
-    if epochs < 1 or batch_size < 1:
-        raise ValueError(message("positive epochs and batch_size", (epochs, batch_size)))
+    for name, value in {"epochs": epochs, "batch_size": batch_size}.items():
+        check_count(name, value)
     entries = {"theta_key": posterior.theta_key, "summary_key": posterior.summary_key}
     pairs, dropped = usable_pairs(data.select(*entries.values(), "weight", strict=False), **entries)
     if dropped:

@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from ..counts import check_count
 from ..errors import message
 from .features import Features
 from .mixtures import Mixture
@@ -67,10 +68,7 @@ class MixtureDensityNetwork(nn.Module):
             raise ValueError(
                 message("a covariance structure", covariance, available=["diagonal", "full"])
             )
-        if components < 1 or features.dim < 1:
-            raise ValueError(
-                message("positive components and summary size", (components, features.dim))
-            )
+        check_count("components", components)
         self.features = features
         self.parameters_, self.components, self.covariance = parameters, components, covariance
         self.reach, self.compress = reach, compress

@@ -28,6 +28,7 @@ from tensordict.nn import (
 )
 from torch import Tensor
 
+from ..counts import check_count
 from ..errors import message
 from .features import Features, FourierFeatures, NeuralFeatures
 from .misspecification import doubts
@@ -69,9 +70,9 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         held_out: Pairs that chose the best epoch of an unweighted fit.
 
     Raises:
-        TypeError: The prior is none of :mod:`.priors`.
-        ValueError: An unknown feature map, or one of summaries of another size; when a state is
-            loaded, one of another prior or another ``compress``.
+        TypeError: The prior is none of :mod:`.priors`, or a size is no whole number.
+        ValueError: A size that is not positive, an unknown feature map, or one of summaries of
+            another size; when a state is loaded, one of another prior or another ``compress``.
 
     Example:
         >>> from tensordict import TensorDict
@@ -103,6 +104,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
             raise TypeError(
                 message("a prior with named parameters", type(prior).__name__, hint=hint)
             )
+        check_count("summary_dim", summary_dim)
         if isinstance(features, str) and features not in MAPS:
             raise ValueError(message("the name of a feature map", features, available=MAPS))
         if isinstance(features, Features) and features.dim != summary_dim:

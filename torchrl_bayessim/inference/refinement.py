@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..counts import check_count
 from ..errors import message
 from ..randomness import seed_from
 from ..sources import Defensive, draw
@@ -71,10 +72,8 @@ class PosteriorRefinement:
         seed: int = 0,
         fit_options: Mapping[str, Any] | None = None,
     ) -> None:
-        if simulations < 4 or networks < 1:
-            raise ValueError(
-                message("at least 4 simulations and 1 network", (simulations, networks))
-            )
+        check_count("simulations", simulations, least=4)
+        check_count("networks", networks)
         self.prior, self.simulations, self.networks = prior, simulations, networks
         self.make_posterior = make_posterior or MixtureDensityPosterior
         self.margin, self.prior_share, self.seed = margin, prior_share, seed

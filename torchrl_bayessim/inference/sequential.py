@@ -17,6 +17,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from ..counts import check_count
 from ..errors import SimulationError, message
 from ..randomness import seed_from
 from ..sources import Defensive, draw
@@ -96,6 +97,7 @@ def sequential(
         One :class:`SequentialRound` after another.
 
     Raises:
+        TypeError: On the first turn, for counts that are no whole numbers.
         ValueError: On the first turn, for an unknown correction, counts that are too small,
             ``observed`` that is not finite, or a simulator that does not give one summary per
             simulation.
@@ -103,9 +105,9 @@ def sequential(
     Warns if the real summaries lie apart from all simulated ones, or the posterior at an edge: see
     :mod:`.misspecification`.
     """
-    if rounds < 1 or simulations < 4 or networks < 1:
-        expected = "at least 1 round, 4 simulations and 1 network"
-        raise ValueError(message(expected, (rounds, simulations, networks)))
+    check_count("rounds", rounds)
+    check_count("simulations", simulations, least=4)
+    check_count("networks", networks)
     if correction not in {"importance", "truncated", "analytic"}:
         raise ValueError(
             message("a correction", correction, available=["importance", "truncated", "analytic"])

@@ -1,0 +1,33 @@
+"""Counts: whole numbers that are large enough."""
+
+from __future__ import annotations
+
+__all__ = ["check_count"]
+
+from operator import index
+from typing import Any
+
+from .errors import message
+
+
+def check_count(name: str, value: Any, *, least: int = 1) -> None:
+    """Refuse what is not a whole number of at least ``least``.
+
+    Raises:
+        TypeError: It is not a whole number: ``16.0`` is none, as for :func:`range`.
+        ValueError: It is too small.
+
+    Example:
+        >>> check_count("episodes", 2)
+        >>> check_count("episodes", 2.5)
+        Traceback (most recent call last):
+        TypeError: expected a whole number of episodes, got 2.5.
+    """
+    try:
+        number = index(value)
+    except TypeError:
+        hint = f"{int(value)}" if isinstance(value, float) and value.is_integer() else ""
+        raise TypeError(message(f"a whole number of {name}", value, hint=hint)) from None
+    if number < least:
+        expected = {0: f"{name} not to be negative", 1: f"{name} to be positive"}
+        raise ValueError(message(expected.get(least, f"at least {least} {name}"), number))
