@@ -4,10 +4,12 @@ import gymnasium
 import pytest
 import torch
 from tensordict import TensorDict
+from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import (
     Compose,
     GymWrapper,
+    ObservationNorm,
     ParallelEnv,
     SerialEnv,
     StepCounter,
@@ -17,6 +19,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
 from torchrl_bayessim.errors import PhysicsError
+from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.physics.attributes import AttributePhysics
 from torchrl_bayessim.sources import Empirical, Grid
@@ -282,6 +285,85 @@ def test_pool_restricts_to_n_draws():
     env = TransformedEnv(SerialEnv(8, physical), DomainRandomizer(Uniform(), pool=3))
     theta = torch.cat([env.reset()["theta"] for _ in range(5)])
     assert len(theta.unique(dim=0)) == 3
+
+
+def test_a_grid_is_followed_whatever_the_pool():
+    """As inference assigns one, to simulate what it drew."""
+    randomizer = DomainRandomizer(Uniform(), pool=3)
+    env = TransformedEnv(SerialEnv(2, physical), randomizer)
+    pool = torch.cat([env.reset()["theta"] for _ in range(9)]).unique(dim=0)
+    points = torch.tensor([[0.3, 0.4], [0.5, 0.6]])
+    randomizer.source = Grid(points, names=NAMES)
+    assert torch.equal(env.reset()["theta"], points)
+    randomizer.source = Uniform()
+    again = env.reset()["theta"]
+    assert all((pool == theta).all(-1).any() for theta in again)
+    with pytest.raises(ValueError, match="a source that samples, to draw a pool from, got 'a Grid"):
+        DomainRandomizer(Grid(points), pool=3)
+
+
+class Flow(nn.Module):
+    """A learned source, whose parameters are no parameters of the randomizer."""
+
+    names = NAMES
+
+    def __init__(self, shift):
+        super().__init__()
+        self.shift = nn.Parameter(torch.tensor(shift))
+
+    def sample(self, shape, *, generator):
+        return (Uniform().sample(shape, generator=generator) + self.shift).detach()
+
+
+def test_a_source_may_be_a_module():
+    env = TransformedEnv(SerialEnv(2, physical), DomainRandomizer(Flow(2.0)))
+    assert (env.reset()["theta"] > 2.0).all()
+    env.transform.source = Flow(4.0)
+    assert isinstance(env.transform.source, Flow)
+    assert (env.reset()["theta"] > 4.0).all()
+    assert not list(env.transform.parameters())
+    env.transform.source = Uniform()
+    assert (env.reset()["theta"] < 2.0).all()
+
+
+def test_an_amortised_posterior_is_to_be_conditioned_first():
+    prior = BoxPrior(dict.fromkeys(NAMES, (0.1, 2.0)))
+    randomizer = DomainRandomizer(prior)
+    with pytest.raises(TypeError, match=r"got 'MixtureDensityPosterior'. Try: posterior.condition"):
+        randomizer.source = MixtureDensityPosterior(prior, 3)
+    assert randomizer.source is prior
+
+
+@pytest.mark.parametrize("make", [SerialEnv, ParallelEnv])
+def test_theta_is_the_simulator_s_whatever_others_make_of_it(make):
+    """A transform that normalises it in place, as for a critic, must not compound."""
+    halved = ObservationNorm(0.0, 0.5, in_keys=["theta"])
+    env = TransformedEnv(make(2, physical), Compose(DomainRandomizer(Uniform()), halved))
+    steps = env.rollout(6, break_when_any_done=False)
+    env.close()
+    theta = 2 * torch.cat([steps["theta"], steps["next", "theta"]])
+    inside = torch.cat([steps["inside"], steps["next", "inside"]])
+    torch.testing.assert_close(theta.double(), inside[..., :2], rtol=1e-6, atol=0)
+
+
+def test_theta_is_not_taken_from_an_old_tensordict():
+    env = with_randomizer(DomainRandomizer(Uniform()))
+    old, now = env.reset(), env.reset()
+    assert not torch.equal(old["theta"], now["theta"])
+    after = env.step(old.set("action", env.action_spec.rand()))["next"]
+    assert torch.equal(after["theta"], now["theta"])
+    assert_simulator_holds_theta(after)
+
+
+def test_two_that_write_one_entry_are_refused():
+    two = [ApplyPhysics(AttributePhysics(name)) for name in NAMES]
+    with pytest.raises(PhysicsError, match=r"one ApplyPhysics that writes 'theta', got 'two'"):
+        TransformedEnv(cartpole(), Compose(*two))
+    with pytest.raises(PhysicsError, match="one Physics of all parameters, or another key="):
+        TransformedEnv(TransformedEnv(cartpole(), two[0]), two[1], auto_unwrap=False)
+    other = ApplyPhysics(AttributePhysics("length"), key="other")
+    env = TransformedEnv(cartpole(), Compose(ApplyPhysics(AttributePhysics("masspole")), other))
+    assert env.reset()["theta"] != env.reset()["other"]
 
 
 def test_state_dict_resumes_the_sequence_of_draws():

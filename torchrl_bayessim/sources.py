@@ -81,13 +81,10 @@ def check_source(source: object) -> None:
         TypeError: ``source`` has no method ``sample``.
     """
     if not callable(getattr(source, "sample", None)):
-        raise TypeError(
-            message(
-                "a source with sample(shape)",
-                type(source).__name__,
-                hint="a prior, a posterior, a torch distribution, or randomizer.pin(theta)",
-            )
-        )
+        hint = "a prior, a posterior, a torch distribution, or randomizer.pin(theta)"
+        if hasattr(source, "condition"):  # what it samples depends on the real data
+            hint = "posterior.condition(summaries of the real trajectories)"
+        raise TypeError(message("a source with sample(shape)", type(source).__name__, hint=hint))
 
 
 def names_of(source: object) -> tuple[str, ...] | None:

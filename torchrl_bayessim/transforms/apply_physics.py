@@ -15,7 +15,8 @@ from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform
 
 from ..errors import PhysicsError, message
 from ..physics.protocol import Physics
-from .resets import resets, simulator
+from ..physics.state import StatePhysics
+from .resets import resets, simulator, transforms_of
 
 
 class ApplyPhysics(Transform):
@@ -33,8 +34,8 @@ class ApplyPhysics(Transform):
         key: The entry that holds θ.
 
     Raises:
-        PhysicsError: The simulator does not have a parameter, or does not hold what was written; or
-            it is one of gymnasium's vector environments.
+        PhysicsError: The simulator does not have a parameter, or does not hold what was written; it
+            is one of gymnasium's vector environments; or another ApplyPhysics writes ``key``.
         TypeError: It is put around a ``SerialEnv`` or ``ParallelEnv`` and not inside; or
             ``physics`` is no `Physics`.
         ValueError: θ is not finite or has another length than ``physics.names``.
@@ -57,6 +58,7 @@ class ApplyPhysics(Transform):
             raise TypeError(message(expected, type(physics).__name__, hint=hint))
         self.physics, self.key = physics, key
         self._written: Tensor | None = None
+        self._held: Tensor | None = None  # float32, of the running episodes
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -86,6 +88,11 @@ class ApplyPhysics(Transform):
             expected = "a simulator per environment, or one that is batched natively"
             hint = "SerialEnv or ParallelEnv of environments with num_envs=1, or BatchedMujocoEnv"
             raise PhysicsError(message(expected, type(env.__dict__["_env"]).__name__, hint=hint))
+        others = (a for a in transforms_of(self.parent, ApplyPhysics) if a is not self)
+        if any(a.key == self.key and a.physics is not self.physics for a in others):
+            expected = f"one ApplyPhysics that writes {self.key!r}"
+            hint = "one Physics of all parameters, or another key= here and in a randomizer"
+            raise PhysicsError(message(expected, "two", hint=hint))
         # Noted on the environment, where it outlasts transforms and their clones, and where a
         # batched environment finds `physics_names` on its workers' environments.
         if self._nominal(env) is None:
@@ -154,8 +161,8 @@ class ApplyPhysics(Transform):
                     hint="does the environment's own reset overwrite it, or its setter clip it?",
                 )
             )
-        theta = held.to(tensordict_reset.device or "cpu", torch.float32)
-        return tensordict_reset.set(self.key, theta)
+        self._held = held.to(tensordict_reset.device or "cpu", torch.float32)
+        return tensordict_reset.set(self.key, self._held.clone())
 
     def inv(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Pass the input on as it is; copied only where TorchRL takes an entry out of it."""
@@ -164,11 +171,12 @@ class ApplyPhysics(Transform):
         return tensordict.copy() if "_step" in tensordict.keys() else tensordict  # noqa: SIM118
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        theta = tensordict.get(self.key, None)
-        if theta is None:
-            env = simulator(self.parent)
-            theta = self.physics.read(env, tensordict=tensordict)
+        # never what the tensordict says: another transform may have normalised it in place
+        if self._held is None or isinstance(self.physics, StatePhysics):
+            theta = self.physics.read(simulator(self.parent), tensordict=tensordict)
             theta = theta.to(next_tensordict.device or "cpu", torch.float32)
+        else:
+            theta = self._held.clone()
         return next_tensordict.set(self.key, theta)
 
     def __repr__(self) -> str:

@@ -12,13 +12,13 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.collectors import BaseCollector
-from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform, TransformedEnv
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform
 
 from ..episode_draws import EpisodeDraws
 from ..errors import PhysicsError, message
 from ..remote_source import PolicyWithSource
 from ..sources import Empirical, Grid, Source, names_of
-from .resets import resets, simulator
+from .resets import resets, simulator, transforms_of
 from .workers import first_of_worker, in_worker, note_seeds
 
 
@@ -41,13 +41,16 @@ class DomainRandomizer(Transform):
         first_environment: The global number of the first environment here. By default the
             collector's worker number times the number of environments, or 0; give it where the
             workers of a collector have different numbers of environments.
-        pool: Restrict to this many draws, made once (the BayesSim paper's 100 domains).
+        pool: Restrict to this many draws, made once (the BayesSim paper's 100 domains). A `Grid`
+            that is assigned later, as inference does, is followed as it is.
 
     Raises:
         PhysicsError: No `ApplyPhysics` before it writes ``key``, or for other parameters; another
             randomizer of ``key``; at a reset, workers of a batched environment that nothing tells
             apart.
         TypeError: The source, now or when assigned, cannot be sampled.
+        ValueError: ``pool`` is not positive, or is given with a `Grid`; the source is over other
+            parameters.
 
     Example:
         >>> from torchrl.envs import Compose, GymEnv, TransformedEnv
@@ -75,6 +78,8 @@ class DomainRandomizer(Transform):
         pool: int | None = None,
     ) -> None:
         super().__init__()
+        if pool is not None and isinstance(source, Grid):
+            raise ValueError(message("a source that samples, to draw a pool from", "a Grid"))
         self.key, self.first_environment, self.pool = key, first_environment, pool
         # Shared with clones, of which TorchRL makes one when it unwraps nested environments.
         self._shared: dict[str, Any] = {"names": names, "seed": seed, "pinned": None}
@@ -95,8 +100,16 @@ class DomainRandomizer(Transform):
         names, known = names_of(source), self._shared["names"]
         if None not in (names, known) and names != known:
             raise ValueError(message(f"a source over {known}", names))
-        draws = EpisodeDraws(source, seed=self._shared["seed"], pool=self.pool, entry=self.key)
+        pool = None if isinstance(source, Grid) else self.pool  # which is for what samples
+        draws = EpisodeDraws(source, seed=self._shared["seed"], pool=pool, entry=self.key)
         self._shared |= {"source": source, "draws": draws, "names": known or names}
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute; a source that is a module (a flow) is a source, and no part of this."""
+        if name == "source":
+            object.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
 
     @property
     def names(self) -> tuple[str, ...] | None:
@@ -302,6 +315,4 @@ class DomainRandomizer(Transform):
 
 def randomizers(env: EnvBase | None) -> Iterator[DomainRandomizer]:
     """Yield the randomizers among the transforms of an environment, and of those that it wraps."""
-    while isinstance(env, TransformedEnv):
-        yield from (m for m in env.transform.modules() if isinstance(m, DomainRandomizer))
-        env = env.base_env
+    yield from transforms_of(env, DomainRandomizer)

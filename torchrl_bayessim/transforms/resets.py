@@ -1,15 +1,18 @@
-"""Which simulator a transform stands before, and which environments a reset concerns."""
+"""What a transform stands before and beside, and which environments a reset concerns."""
 
 from __future__ import annotations
 
-__all__ = ["resets", "simulator"]
+__all__ = ["resets", "simulator", "transforms_of"]
 
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, Transform, TransformedEnv
+
+_T = TypeVar("_T", bound=Transform)
 
 
 def simulator(env: EnvBase | None) -> Any:
@@ -17,6 +20,13 @@ def simulator(env: EnvBase | None) -> Any:
     while isinstance(env, TransformedEnv):
         env = env.base_env
     return env
+
+
+def transforms_of(env: EnvBase | None, kind: type[_T]) -> Iterator[_T]:
+    """Yield the transforms of one kind, of an environment and of those that it wraps."""
+    while isinstance(env, TransformedEnv):
+        yield from (m for m in env.transform.modules() if isinstance(m, kind))
+        env = env.base_env
 
 
 def resets(env: EnvBase | None, tensordict: TensorDictBase) -> Tensor:
