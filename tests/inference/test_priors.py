@@ -107,6 +107,16 @@ def test_a_logarithmic_parameter_of_many_decades_excludes_zero():
     assert prior.contains(prior.sample((1000,), generator=generator(0))).all()
 
 
+def test_the_widest_logarithmic_parameter_has_moments_and_samples():
+    prior = BoxPrior({"a": (1.2e-38, 1e18)}, log=["a"])
+    theta = prior.sample((1000,), generator=generator(0))
+    assert prior.contains(theta).all()
+    assert prior.log_prob(theta).isfinite().all()
+    width = math.log(1e18) - math.log(1.2e-38)
+    assert prior.mean.item() == pytest.approx(1e18 / width)
+    assert prior.standardize(theta).std().item() == pytest.approx(1, abs=0.05)
+
+
 def test_the_bounds_themselves_are_inside():
     prior = box()
     assert prior.contains(torch.stack([prior.low, prior.high])).all()
@@ -209,6 +219,8 @@ def test_priors_show_their_names_and_numbers():
         ({"a": (0, math.inf)}, [], "finite bounds for 'a' .* Try: .*GaussianPrior"),
         ({"a": (math.nan, 1)}, [], "finite bounds for 'a'"),
         ({"a": (0, 1)}, ["a"], "a positive lower bound for the logarithmic parameter 'a'"),
+        ({"a": (1e-50, 1)}, ["a"], r"parameter 'a' of at least 1.2e-38, .* got \(1e-50, 1.0\)"),
+        ({"a": (1e-40, 1)}, ["a"], "since parameters are kept in float32"),
         ({"mass": (1, 2)}, ["mas"], r"log= to name .* got 'mas'. Available: mass \(did you"),
     ],
 )
@@ -230,6 +242,11 @@ def test_a_box_that_cannot_be_is_refused(bounds, log, match):
             {"a": (0, 1), "b": (0, 1)},
             torch.tensor([[1.0, 1.5], [1.5, 1.0]]),
             "a positive definite correlation matrix",
+        ),
+        (
+            {"a": (0, 1), "b": (0, 1)},
+            torch.tensor([[1.0, 0.3], [0.5, 1.0]]),
+            "a symmetric correlation matrix",
         ),
     ],
 )

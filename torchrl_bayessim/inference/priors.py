@@ -129,7 +129,7 @@ class BoxPrior(Prior):
     Raises:
         ValueError: For no parameters, duplicate names, reversed, equal, infinite or NaN bounds,
             bounds that float32 cannot tell apart, and a logarithmic parameter whose lower bound is
-            not positive.
+            not positive in float32, down to its smallest normal number of 1.2e-38.
         TypeError: ``log`` is a string and not a list of names, or a name is no string.
 
     Example:
@@ -187,8 +187,10 @@ class BoxPrior(Prior):
     @property
     def mean(self) -> Tensor:
         """The prior means, shape ``(D,)``."""
-        width = torch.where(self.log, (self.high / self.low).log(), 1.0)
-        return torch.where(self.log, (self.high - self.low) / width, (self.low + self.high) / 2)
+        low, high = self.low.double(), self.high.double()  # float32 may not hold their ratio
+        width = torch.where(self.log, (high / low).log(), 1.0)
+        mean = torch.where(self.log, (high - low) / width, (low + high) / 2)
+        return mean.to(self.low.dtype)
 
     @property
     def variance(self) -> Tensor:
@@ -282,6 +284,15 @@ def _check_bounds(
                     hint="a small positive lower bound, or drop it from log=",
                 )
             )
+        if name in log and np.float32(low) < np.finfo(np.float32).tiny:
+            raise ValueError(
+                message(
+                    f"a lower bound for the logarithmic parameter {name!r} of at least "
+                    f"{np.finfo(np.float32).tiny:.2g}, since parameters are kept in float32",
+                    (low, high),
+                    hint="a larger lower bound, or another unit",
+                )
+            )
     for name in log:
         if name not in names:
             raise ValueError(message("log= to name declared parameters", name, available=names))
@@ -297,7 +308,8 @@ class GaussianPrior(Prior):
 
     Raises:
         ValueError: For no parameters, duplicate names, NaN or infinite moments, standard
-            deviations that are not positive, and a correlation that is not positive definite.
+            deviations that are not positive, and a correlation that is not symmetric and positive
+            definite.
 
     Example:
         >>> prior = GaussianPrior({"mass": (4.0, 0.5), "offset": (0.0, 0.1)})
@@ -388,6 +400,8 @@ def _correlation_tril(correlation: Tensor | None, size: int) -> Tensor:
                 tuple(correlation.shape),
             )
         )
+    if not torch.allclose(correlation, correlation.mT):
+        raise ValueError(message("a symmetric correlation matrix", correlation.tolist()))
     tril, failed = torch.linalg.cholesky_ex(correlation)
     if failed:
         raise ValueError(message("a positive definite correlation matrix", correlation.tolist()))
