@@ -217,3 +217,8 @@ def test_pairs_that_have_no_loss_are_refused_or_masked(entry, bad, said, reducti
     assert value(data, reduction="none").isfinite().sum() == 7
     data["mask"] = torch.arange(8) != 2
     assert value(data, reduction=reduction).isfinite()
+
+
+def test_a_network_that_is_no_posterior_is_refused_at_once():
+    with pytest.raises(TypeError, match=r"a posterior network with get_dist.*got 'Linear'"):
+        PosteriorLoss(torch.nn.Linear(4, 2))

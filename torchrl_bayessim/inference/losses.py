@@ -40,7 +40,7 @@ class PosteriorLoss(LossModule):
 
     Raises:
         KeyError: In a call, for pairs without parameters or summaries.
-        TypeError: For masks that are not booleans.
+        TypeError: For a network that is no posterior; in a call, for masks that are not booleans.
         ValueError: For weights or masks of another number than the pairs, weights that are negative
             or not finite; for a mean or sum over pairs that
             are not finite or outside the prior.
@@ -75,6 +75,9 @@ class PosteriorLoss(LossModule):
         super().__init__()
         if reduction not in {"mean", "sum", "none"}:
             raise ValueError(message("a reduction", reduction, available=["mean", "sum", "none"]))
+        if not callable(getattr(posterior_network, "get_dist", None)):
+            expected = "a posterior network with get_dist, such as a MixtureDensityPosterior"
+            raise TypeError(message(expected, type(posterior_network).__name__))
         self.reduction = reduction
         self.convert_to_functional(posterior_network, "posterior_network")
 
