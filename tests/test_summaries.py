@@ -243,6 +243,43 @@ def test_parameters_are_handed_on_under_their_own_key():
     assert "theta" not in found
 
 
+COUNTING = {
+    "end": torch.arange(20) < 13,
+    "begin": torch.arange(20) >= 7,
+    "hole": (torch.arange(20) < 5) | (torch.arange(20) >= 8),
+}
+
+
+@pytest.mark.parametrize("counting", COUNTING.values(), ids=COUNTING.keys())
+@every_summary
+def test_steps_outside_the_mask_are_never_read_wherever_they_are(summary, counting):
+    state, action, following, _ = trajectory(4)
+    steps = {"observation": state, "action": action, "next": {"observation": following}}
+    mask = counting.expand(4, 20)
+    theta = torch.where(mask, 0.7, torch.nan).unsqueeze(-1)
+    data = TensorDict(steps | {"mask": mask, "theta": theta}, [4, 20])
+    other = data.clone()
+    for key in ("observation", "action", ("next", "observation")):
+        other.set(key, torch.where(mask.unsqueeze(-1), data[key], 1e3))
+    statistics = SummaryStatistics(summary)
+    assert torch.equal(statistics(data)["summary"], statistics(other)["summary"])
+    assert torch.equal(statistics.together(data), statistics.together(other))
+    assert statistics(data)["theta"].tolist() == 4 * [[torch.tensor(0.7).item()]]
+
+
+def test_waypoints_are_states_that_count():
+    state, action, following, mask = trajectory()
+    mask = mask & (torch.arange(20) >= 8)
+    found = waypoints(2)(state, action, following, mask)
+    assert torch.equal(found, following[[13, 19]].flatten())
+
+
+@pytest.mark.parametrize("angles", ["0", 1, (0.0,), ["angle"]])
+def test_angles_are_a_sequence_of_columns(angles):
+    with pytest.raises(TypeError, match=r"a sequence of columns .* that are angles.*angles=\(0,\)"):
+        SummaryStatistics(moments, angles=angles)
+
+
 def test_waypoints_must_be_some():
     with pytest.raises(ValueError, match="waypoints to be positive, got 0"):
         waypoints(0)

@@ -25,6 +25,7 @@ __all__ = [
 
 import math
 from collections.abc import Callable, Sequence
+from operator import index
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -150,9 +151,9 @@ def waypoints(count: int) -> Summary:
         del state, action
         length = mask.sum(-1, keepdim=True).clamp_min(1)
         share = torch.arange(1, count + 1, device=mask.device) / count
-        index = (share * length).ceil().long().clamp_min(1) - 1
-        index = index.unsqueeze(-1).expand(*index.shape, next_state.shape[-1])
-        return next_state.gather(-2, index).flatten(-2)
+        place = (share * length).ceil().long().clamp_min(1) - 1  # among the steps that count
+        step = (~mask).long().argsort(dim=-1, stable=True).gather(-1, place)
+        return next_state.take_along_dim(step.unsqueeze(-1), -2).flatten(-2)
 
     return _ordered(summary, f"waypoints({count})")
 
@@ -220,7 +221,7 @@ class SummaryStatistics(TensorDictModuleBase):
         theta_key: Key of the parameters, which are handed on where present.
 
     Raises:
-        TypeError: For what is not a function.
+        TypeError: For what is not a function, or angles that are no sequence of columns.
         ValueError: For no functions; in a call, for discrete actions given as indices, no step, no
             batch size, or observations that are no vectors.
         KeyError: In a call, for a missing entry.
@@ -249,7 +250,7 @@ class SummaryStatistics(TensorDictModuleBase):
             if not callable(function):
                 expected = "functions of (state, action, next_state, mask)"
                 raise TypeError(message(expected, function, hint="summaries.linear_dynamics"))
-        self.functions, self.angles = functions, tuple(angles)
+        self.functions, self.angles = functions, _columns(angles)
         self.observation_key, self.action_key = observation_key, action_key
         self.theta_key, self.one_hot = theta_key, one_hot
         self.in_keys = [observation_key, action_key, next_key(observation_key), ("next", "done")]
@@ -298,7 +299,10 @@ class SummaryStatistics(TensorDictModuleBase):
         out = TensorDict({}, batch_size=tensordict.batch_size[:-1])
         out.set(self.out_keys[0], torch.cat(list(values.values()), -1))
         theta = tensordict.get(self.theta_key, None)
-        return out if theta is None else out.set(self.theta_key, theta[..., 0, :])
+        if theta is None:
+            return out
+        first = tensordict.get("mask").long().argmax(-1)[..., None, None]
+        return out.set(self.theta_key, theta.take_along_dim(first, -2).squeeze(-2))
 
     def _values(
         self, tensordict: TensorDictBase, *, ordered: bool | None = None
@@ -363,6 +367,14 @@ class SummaryStatistics(TensorDictModuleBase):
         keys = f"{self.observation_key!r}, {self.action_key!r} -> {self.out_keys[0]!r}"
         options = "" if self.one_hot else ", one_hot=False"
         return f"SummaryStatistics({', '.join(names)}, angles={self.angles}, {keys}{options})"
+
+
+def _columns(angles: Sequence[int]) -> tuple[int, ...]:
+    try:
+        return tuple(index(column) for column in angles)
+    except TypeError:
+        expected = "a sequence of columns of the observation that are angles"
+        raise TypeError(message(expected, angles, hint="angles=(0,)")) from None
 
 
 def _check_entries(trajectories: TensorDictBase, keys: Sequence[NestedKey]) -> None:
