@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from ..logs.system import System
+from .model import unevenness
 from .preparation import Prepared
 from .report import Candidate, Finding, Verdict
 from .selection import Selection
@@ -29,6 +30,7 @@ from .shrinkage import Shrinkage
 
 _NEGLIGIBLE = 0.05  # of the noise floor: an excess that no one would chase
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
+_UNEVEN = 5.0  # standard errors; or that what is left varies more between segments than noise
 _SHOWN = 1.2  # mean squared innovation of runs that show a gap
 _ALL, _NAMED, _PARTIAL = 0.98, 0.8, 0.4
 
@@ -54,7 +56,10 @@ def conclude(
     significant = selection.p_values[0] <= alpha
     splits = [float((m**2).mean()) for m in
               (selection.nominal.fit.innovations, selection.nominal.validation)]  # fmt: skip
-    visible = measured.excess_ci[0] > 0 and min(measured.refit, *splits) > _UNEXPLAINED
+    unlike_noise = min(measured.refit, *splits) > _UNEXPLAINED or (
+        significant and unevenness(selection.best) > _UNEVEN
+    )
+    visible = measured.excess_ci[0] > 0 and unlike_noise
     left = measured.remainder_ci[0] > _NEGLIGIBLE and measured.explained < _ALL
     validated = _validated(selection)
     perhaps_nothing = measured.explained_ci[0] <= 0 and validated < _PARTIAL

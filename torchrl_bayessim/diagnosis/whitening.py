@@ -32,6 +32,8 @@ Array = NDArray[np.float64]
 _WORST = 1e3  # innovations beyond this, and those of diverged simulations, count as this
 _KNOWN = 3.0  # times the error of an estimate that knows what it is to predict
 _ROUNDING = 1e-13  # of the largest variance
+_MOST, _HALF, _CALM = 0.9, 0.5, 0.25  # shares of the segments that noise is estimated from
+_UNEVEN = 1.3  # ratio of the first two estimates, beyond which some segments hold more than noise
 _DRAWS = 8  # simulated robots that the whitening is checked on
 _THIRD_DIFFERENCE = 20.0  # 1 + 9 + 9 + 1: variance of y₃ - 3y₂ + 3y₁ - y₀ per unit of white noise
 
@@ -180,7 +182,9 @@ def innovation_noise(innovations: Array, pushes: Array, checks: int) -> Array:
     ``σ̂² = mean ½(ε_{t+1} - ε_t)²`` over innovations in order of time, divided by what unit noise
     gives in the same way: a model's error is smooth, and so drops out. What a constant force at any
     joint could explain within the segment is projected out first, since over a few steps a missing
-    force is hardly more than that. The worst tenth of the segments is left out.
+    force is hardly more than that. The worst tenth of the segments is left out, or, where the worse
+    half has more than its part, all but the calmest quarter: noise is the same everywhere, and what
+    a missing effect does, such as an impact where backlash closes, is not.
 
     Args:
         innovations: Shape ``(S, KC)``.
@@ -193,10 +197,14 @@ def innovation_noise(innovations: Array, pushes: Array, checks: int) -> Array:
     left = left * (values > 1e-6 * np.maximum(values[:, :1], 1e-12))[:, None]
     steps = np.eye(size)[channels:] - np.eye(size)[:-channels]
 
-    def spread(some: Array) -> Array:
+    def spread(some: Array, share: float) -> Array:
         rest = some - np.einsum("smj,snj,sn->sm", left, left, some)
         squares = ((rest @ steps.T) ** 2).reshape(len(some), checks - 1, channels).sum(1)
-        return np.where(squares <= np.quantile(squares, 0.9, axis=0), squares, 0.0).sum(0)
+        return np.where(squares <= np.quantile(squares, share, axis=0), squares, 0.0).sum(0)
 
     noise = np.random.default_rng(0).standard_normal((8, *innovations.shape))
-    return np.sqrt(spread(innovations) / np.mean([spread(one) for one in noise], axis=0))
+    most, half, calm = (
+        spread(innovations, share) / np.mean([spread(one, share) for one in noise], axis=0)
+        for share in (_MOST, _HALF, _CALM)
+    )
+    return np.sqrt(np.where(most > _UNEVEN * half, calm, most))
