@@ -27,6 +27,7 @@ LAYERS = [
     {"transforms"},
     {
         "diverged",
+        "pairs",
         "simulate",
         "ray_collectors",
         "ray_worker",

@@ -158,7 +158,7 @@ class RayCollectors:
         shares = range(0, len(theta), pairs)
         for turn in range(0, len(shares), self.workers):
             asking = [
-                (question, theta[start : start + pairs], batches * number, keep)
+                (question, theta[start : start + pairs].clone(), batches * number, keep)
                 for number, start in enumerate(shares[turn : turn + self.workers], turn)
             ]
             idle = [(None, theta[:0], 0, 0)] * (self.workers - len(asking))

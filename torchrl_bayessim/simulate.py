@@ -10,6 +10,8 @@ from __future__ import annotations
 __all__ = ["collect_summaries", "make_collector", "next_batch", "simulate", "summaries_in_turn"]
 
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -23,11 +25,13 @@ from tqdm.auto import tqdm
 from .counts import check_count
 from .diverged import UndisturbedPolicy
 from .errors import PhysicsError, SimulationError, message
+from .pairs import empty_pairs, fill_parameters, fill_summaries
 from .randomness import isolated, seed_from
-from .sources import Grid, draw
+from .sources import Grid
 from .summaries import SummaryStatistics
 from .trajectories import concatenate, first_trajectories
 from .transforms.domain_randomizer import DomainRandomizer
+from .whole_file import replacing_folder
 
 if TYPE_CHECKING:
     from .ray_collectors import RayCollectors
@@ -209,6 +213,7 @@ def simulate(
     max_steps: int,
     trajectories: int = 1,
     seed: int = 0,
+    folder: str | Path | None = None,
     collectors: RayCollectors | None = None,
     progress: bool = True,
 ) -> TensorDictBase:
@@ -223,12 +228,16 @@ def simulate(
         max_steps: Steps after which a trajectory is cut.
         trajectories: Number of trajectories per pair, which are summarised together.
         seed: Same seed, same pairs.
+        folder: Where the pairs are to lie as a memory-mapped TensorDict, which is returned. A part
+            at a time is in memory then, in :func:`.inference.fit.fit` too. It must not exist, and
+            does when all pairs are in it; later ``TensorDict.load_memmap(folder)`` has them.
         collectors: On Ray, to simulate there: the same pairs.
         progress: Whether to show a progress bar.
 
     Raises:
         TypeError: A count is no whole number.
         ValueError: A count is not positive, or the collectors have other environments.
+        FileExistsError: There is such a folder.
 
     Example:
         >>> from torchrl.envs import Compose, TransformedEnv
@@ -247,15 +256,21 @@ def simulate(
     counts = {"pairs": pairs, "max_steps": max_steps, "trajectories": trajectories}
     for name, value in counts.items():
         check_count(name, value)
-    theta = draw(randomizer.source, pairs, key=(seed, "theta"))  # pyright: ignore[reportArgumentType]
-    asked: dict[str, Any] = {"trajectories": trajectories, "key": (seed,), "progress": progress}
     if collectors is not None:
         collectors.check(env)
-        summaries, _ = collectors.summaries(policy, statistics, theta, steps=max_steps, **asked)
-    else:
-        collector = make_collector(env, policy, steps=max_steps)
-        try:
-            summaries, _ = collect_summaries(collector, statistics, randomizer, theta, **asked)
-        finally:
-            collector.shutdown(close_env=False)
-    return TensorDict({"theta": theta, "summary": summaries}, batch_size=[pairs])
+    asked: dict[str, Any] = {"trajectories": trajectories, "key": (seed,)}
+    with nullcontext() if folder is None else replacing_folder(folder) as beside:
+        found = empty_pairs(pairs, beside)
+        theta = fill_parameters(found, randomizer.source, key=(seed, "theta"))  # pyright: ignore[reportArgumentType]
+        if collectors is not None:
+            asked["steps"] = max_steps
+            turns = collectors.summaries_in_turn(policy, statistics, theta, **asked)
+            fill_summaries(found, turns, progress=progress)
+        else:
+            collector = make_collector(env, policy, steps=max_steps)
+            try:
+                turns = summaries_in_turn(collector, statistics, randomizer, theta, **asked)
+                fill_summaries(found, turns, progress=progress)
+            finally:
+                collector.shutdown(close_env=False)
+    return found if folder is None else TensorDict.load_memmap(folder)

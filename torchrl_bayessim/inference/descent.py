@@ -11,6 +11,7 @@ __all__ = ["descend"]
 
 import copy
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -21,6 +22,7 @@ from tqdm.auto import tqdm
 from ..errors import SimulationError, message
 from ..randomness import generator
 from .posterior import TRAINING_POINTS, MixtureDensityPosterior
+from .rows import Rows
 from .truncation import TruncatedGaussianMixture
 
 _WARM_UP = 0.1  # share of the steps in which the learning rate rises
@@ -38,7 +40,7 @@ class _Pairs(NamedTuple):
 
 def descend(
     posterior: MixtureDensityPosterior,
-    train: TensorDictBase,
+    train: TensorDictBase | Rows,
     validation: TensorDictBase,
     *,
     epochs: int,
@@ -53,7 +55,7 @@ def descend(
 
     Args:
         posterior: Changed in place.
-        train: Pairs to learn from.
+        train: Pairs to learn from, or rows of pairs on disk, which are read as they are needed.
         validation: Pairs that say which epoch is the best.
         epochs: At most so many passes.
         batch_size: Pairs per step.
@@ -66,8 +68,7 @@ def descend(
     Raises:
         SimulationError: The loss is not finite.
     """
-    pairs, held = _prepared(posterior, train), _prepared(posterior, validation)
-    everything = torch.arange(len(held.z))
+    pairs, held = _reader(posterior, train), _prepared(posterior, validation)
     batches = math.ceil(len(train) / batch_size)
     steps = epochs * batches
     optimizer = torch.optim.AdamW(
@@ -85,7 +86,7 @@ def descend(
             truncated, stale = True, 0
         total = 0.0
         for rows in torch.randperm(len(train), generator=shuffle).chunk(batches):
-            loss = _loss(posterior, pairs, rows, truncated=truncated)
+            loss = _loss(posterior, pairs(rows), truncated=truncated)
             _check_loss(loss)
             optimizer.zero_grad()
             loss.backward()
@@ -94,7 +95,7 @@ def descend(
             schedule.step()
             total += loss.item() * len(rows) / len(train)
         with torch.no_grad():
-            held_out = _loss(posterior, held, everything, truncated=True).item()
+            held_out = _loss(posterior, held, truncated=True).item()
         losses[0].append(total)
         losses[1].append(held_out)
         bar.set_postfix(train=f"{total:.2f}", held_out=f"{held_out:.2f}")
@@ -115,11 +116,11 @@ def _widen(posterior: MixtureDensityPosterior, held: _Pairs) -> None:
     A network is surer of the pairs that it learned from than of others; one number, learned from
     the others, undoes most of it (temperature scaling, Guo et al., 2017, arXiv:1706.04599).
     """
-    widening, everything = posterior.network.widening, torch.arange(len(held.z))
+    widening = posterior.network.widening
     scores = {}
     for factor in _WIDENINGS:
         widening.fill_(factor)
-        scores[factor] = _loss(posterior, held, everything, truncated=True).item()
+        scores[factor] = _loss(posterior, held, truncated=True).item()
     widening.fill_(min(scores, key=scores.__getitem__))
 
 
@@ -129,6 +130,16 @@ def _one_cycle(step: int, steps: int) -> float:
     if step < rise:
         return 0.1 + 0.9 * step / rise
     return 0.5 * (1 + math.cos(math.pi * min(1.0, (step - rise) / max(1.0, steps - rise))))
+
+
+def _reader(
+    posterior: MixtureDensityPosterior, pairs: TensorDictBase | Rows
+) -> Callable[[Tensor], _Pairs]:
+    """Return what gives rows of the pairs: prepared once where all of them are in memory."""
+    if isinstance(pairs, Rows):
+        return lambda rows: _prepared(posterior, pairs[rows])
+    whole = _prepared(posterior, pairs)
+    return lambda rows: _Pairs(*(value[rows] for value in whole))
 
 
 def _prepared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> _Pairs:
@@ -141,12 +152,10 @@ def _prepared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> _Pai
     return _Pairs(pairs.get(posterior.summary_key), z, volume, weight)
 
 
-def _loss(
-    posterior: MixtureDensityPosterior, pairs: _Pairs, rows: Tensor, *, truncated: bool
-) -> Tensor:
+def _loss(posterior: MixtureDensityPosterior, pairs: _Pairs, *, truncated: bool) -> Tensor:
     """Return the weighted negative log-density in nats, as `PosteriorLoss` does."""
     network = posterior.network
-    logits, loc, scale_tril = network(pairs.summary[rows])
+    logits, loc, scale_tril = network(pairs.summary)
     mixture = TruncatedGaussianMixture(
         logits,
         loc,
@@ -155,8 +164,8 @@ def _loss(
         diagonal=network.covariance == "diagonal",
         points=TRAINING_POINTS,
     )
-    weight = pairs.weight[rows]
-    loss = pairs.volume[rows] - mixture.log_prob(pairs.z[rows])
+    weight = pairs.weight
+    loss = pairs.volume - mixture.log_prob(pairs.z)
     total = torch.where(weight > 0, weight * loss, 0.0).sum()
     return total / weight.sum().clamp_min(1e-12)
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import torch
 from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
 
 from ..counts import check_count
 from ..errors import SimulationError, message
@@ -18,8 +19,10 @@ from ..randomness import generator
 from .descent import descend
 from .features import FourierFeatures
 from .posterior import MixtureDensityPosterior
+from .rows import Rows, mapped, parts
 
 _SEEN = 1000  # summaries kept to compare real ones with
+_HELD_OUT = 2**14  # pairs are enough to choose an epoch by, and all are held in memory
 
 
 @dataclass(frozen=True)
@@ -58,23 +61,32 @@ def usable_pairs(
         ValueError: If there are no pairs, or one of the two entries is missing.
         SimulationError: If none is left.
     """
-    for key in (theta_key, summary_key):
+    rows = _usable_rows(data, theta_key, summary_key)
+    return data[rows], len(data) - len(rows)
+
+
+def _usable_rows(data: TensorDictBase, *keys: NestedKey) -> Tensor:
+    for key in keys:
         if data.get(key, None) is None:
             found = sorted(map(str, data.keys(include_nested=True)))
             raise ValueError(message("pairs with an entry", str(key), available=found))
     if not data.batch_size.numel():
         raise ValueError(message("at least one pair", "none", hint="simulate some"))
-    good = data[theta_key].isfinite().all(-1) & data[summary_key].isfinite().all(-1)
-    dropped = int((~good).sum())
-    if dropped == good.numel():
+    good = torch.cat(
+        [
+            torch.stack([data[part].get(key).isfinite().all(-1) for key in keys]).all(0)
+            for part in parts(len(data))
+        ]
+    )
+    if not good.any():
         raise SimulationError(
             message(
                 "at least one simulation with finite summaries",
-                f"{dropped} diverged simulations of {dropped}",
+                f"{len(good)} diverged simulations of {len(good)}",
                 hint="a smaller prior, a smaller time step, or a summary that masks the divergence",
             )
         )
-    return data[good], dropped
+    return good.nonzero().flatten()
 
 
 def fit(
@@ -95,6 +107,9 @@ def fit(
 
     If the posterior was made with an ``in_key`` or ``out_key``, the pairs' entries are those.
 
+    Pairs on disk, of ``simulate(folder=)`` or ``memmap_``, stay there: a minibatch is read at a
+    time.
+
     AdamW with one cycle of the learning rate: see :mod:`.descent`. After every epoch the loss on
     held-out pairs is computed, and the parameters of the best epoch are kept. Pairs that are not
     finite are dropped and counted.
@@ -106,7 +121,8 @@ def fit(
         batch_size: Pairs per step.
         lr: Highest learning rate.
         weight_decay: Of AdamW.
-        validation_fraction: Share of the pairs that is held out: at least one, all but two at most.
+        validation_fraction: Share of the pairs that is held out: at least one, all but two at
+            most, and no more than 16,384.
         patience: Epochs without improvement after which it stops: see :func:`.descent.descend`.
         rescale: Whether to set the input scaling from these pairs (yes on the first fit).
         seed: Of the split and of the minibatches.
@@ -124,23 +140,25 @@ def fit(
         raise ValueError(message("a validation_fraction between 0 and 1", validation_fraction))
     for name, value in {"epochs": epochs, "batch_size": batch_size}.items():
         check_count(name, value)
-    entries = {"theta_key": posterior.theta_key, "summary_key": posterior.summary_key}
-    pairs, dropped = usable_pairs(data.select(*entries.values(), "weight", strict=False), **entries)
-    if dropped:
+    keys = (posterior.theta_key, posterior.summary_key)
+    data = data.select(*keys, "weight", strict=False)
+    rows = _usable_rows(data, *keys)
+    if dropped := len(data) - len(rows):
         warnings.warn(
             f"{dropped} of {len(data)} simulations are not finite: left out", stacklevel=2
         )
-    _check_pairs(posterior, pairs)
-    order = torch.randperm(len(pairs), generator=generator(seed, "split"))
-    held_out = min(max(1, round(validation_fraction * len(pairs))), len(pairs) - 2)
-    validation, train = pairs[order[:held_out]], pairs[order[held_out:]].contiguous()
+    _check_pairs(posterior, Rows(data, rows))
+    order = rows[torch.randperm(len(rows), generator=generator(seed, "split"))]
+    held_out = min(max(1, round(validation_fraction * len(rows))), len(rows) - 2, _HELD_OUT)
+    validation, train = data[order[:held_out]], Rows(data, order[held_out:])
     if rescale:
-        posterior.network.standardize_inputs(train.get(posterior.summary_key))
-    posterior.seen = train.get(posterior.summary_key)[:_SEEN]
-    posterior.held_out = None if "weight" in pairs.keys() else validation  # noqa: SIM118
+        summaries = (part.get(posterior.summary_key) for part in train.parts())
+        posterior.network.standardize_inputs(summaries)
+    posterior.seen = train[:_SEEN].get(posterior.summary_key)
+    posterior.held_out = None if "weight" in data.keys() else validation  # noqa: SIM118
     trace = descend(
         posterior,
-        train,
+        train if mapped(data) else train[:],
         validation,
         epochs=epochs,
         batch_size=batch_size,
@@ -150,30 +168,31 @@ def fit(
         seed=seed,
         progress=progress,
     )
-    return FitReport(len(pairs), dropped, len(trace[0]), *trace)
+    return FitReport(len(rows), dropped, len(trace[0]), *trace)
 
 
-def _check_pairs(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> None:
+def _check_pairs(posterior: MixtureDensityPosterior, pairs: Rows) -> None:
     if len(pairs) < 4:
         raise ValueError(message("at least 4 usable pairs", len(pairs), hint="simulate more"))
     expected = (len(posterior.prior.names), len(posterior.network.shift))
-    theta, summary = pairs[posterior.theta_key], pairs[posterior.summary_key]
-    got = (theta.shape[-1], summary.shape[-1])
+    got = tuple(pairs[:1].get(k).shape[-1] for k in (posterior.theta_key, posterior.summary_key))
     if got != expected:
         raise ValueError(message("pairs with (D, L) of the posterior, " + str(expected), got))
-    weight = pairs.get("weight", None)
-    if weight is not None:
+    if "weight" in pairs.pairs.keys():  # noqa: SIM118
+        weight = torch.cat([part.get("weight") for part in pairs.parts()])
         good = weight.isfinite() & (weight >= 0)
         if not good.all() or not weight.any():
             text = f"{int((~good).sum())} that are not, sum {weight.sum().item():.3g}"
             raise ValueError(message("finite weights of 0 or more, some positive", text))
-    outside = ~posterior.prior.contains(theta)
-    if outside.any():
-        row = int(outside.nonzero()[0])
+    theta = (part.get(posterior.theta_key) for part in pairs.parts())
+    inside = torch.cat([posterior.prior.contains(part) for part in theta])
+    if not inside.all():
+        row = int((~inside).nonzero()[0])
+        first = pairs[row : row + 1].get(posterior.theta_key)[0]
         raise ValueError(
             message(
                 f"parameters inside the prior {posterior.prior!r}",
-                f"{int(outside.sum())} outside it, the first {theta[row].tolist()}",
+                f"{int((~inside).sum())} outside it, the first {first.tolist()}",
                 hint="the prior that the parameters were drawn from",
             )
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 __all__ = ["Covariance", "MixtureDensityNetwork", "melu"]
 
+from collections.abc import Iterable
 from typing import Literal
 
 import torch
@@ -13,6 +14,7 @@ from ..counts import check_count
 from ..errors import message
 from .features import Features
 from .mixtures import Mixture
+from .rows import spread
 
 Covariance = Literal["diagonal", "full"]
 WIDEST = 4.0  # of a component, in prior deviations: nearly flat over a box, which spans 3.5
@@ -88,10 +90,14 @@ class MixtureDensityNetwork(nn.Module):
         self.register_buffer("scale", torch.ones(features.dim))
         self.register_buffer("widening", torch.ones(()))
 
-    def standardize_inputs(self, summaries: Tensor) -> None:
-        """Set the input scaling from training summaries ``(N, L)``; constant ones are ignored."""
-        mean, sd = summaries.mean(0), summaries.std(0)
-        constant = sd <= 1e-6 * (1e-12 + summaries.abs().amax(0))
+    def standardize_inputs(self, summaries: Tensor | Iterable[Tensor]) -> None:
+        """Set the input scaling from training summaries ``(N, L)``, or from parts of them.
+
+        Constant ones are ignored.
+        """
+        whole = isinstance(summaries, Tensor)
+        mean, sd, largest = spread([summaries] if whole else summaries)
+        constant = sd <= 1e-6 * (1e-12 + largest)
         self.shift.copy_(mean)
         self.scale.copy_(torch.where(constant, torch.inf, sd))
 
