@@ -78,7 +78,8 @@ def make_loop(env=None, randomizer=None, *, learner=None, robot=None, **options)
         "shared_batches": 1,
         "rounds": 2,
     } | options
-    fit = {"make_posterior": small, "networks": 1, "fit_options": QUICK}
+    fit = {"make_posterior": small, "networks": 1}
+    fit["fit_options"] = options.pop("fit_options", QUICK)
     epochs = options.pop("epochs", 1)
     return SimToRealLoop(
         env,
@@ -143,10 +144,10 @@ def test_real_data_and_true_parameters_are_in_no_training_set(monkeypatch):
     pairs, observed = [], []
     learn = PosteriorRefinement.learn
 
-    def watched(self, theta, summary, real, *, key):
+    def watched(self, theta, summary, real, **options):
         pairs.append((theta, summary))
         observed.append(torch.atleast_2d(real))
-        return learn(self, theta, summary, real, key=key)
+        return learn(self, theta, summary, real, **options)
 
     monkeypatch.setattr(PosteriorRefinement, "learn", watched)
     loop = make_loop(rounds=2)
@@ -353,6 +354,14 @@ def test_other_settings_must_not_be_negative(name):
 def test_counts_are_whole_numbers(name, value):
     with pytest.raises(TypeError, match=f"a whole number of {name}, got '?{value}"):
         make_loop(robot=make_robot(), **{name: value})
+
+
+def test_a_quiet_loop_has_quiet_fits_unless_they_are_asked_to_talk(capsys):
+    shown = []
+    for options in ({}, {"progress": True}):
+        list(make_loop(rounds=1, updates=1, fit_options={"epochs": 1} | options))
+        shown.append("epoch" in capsys.readouterr().err)
+    assert shown == [False, True]
 
 
 def test_more_than_ten_rounds():

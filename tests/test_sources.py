@@ -53,7 +53,7 @@ def test_defensive_draws_from_the_prior_as_often_as_its_weight():
 def test_defensive_refuses_other_names_and_impossible_weights():
     with pytest.raises(ValueError, match=r"a prior over \('a', 'b'\)"):
         Defensive(Normal(0.0, ("a", "b")), Normal(0.0, ("b", "a")), 0.1)
-    with pytest.raises(ValueError, match="a probability of a prior draw"):
+    with pytest.raises(ValueError, match="prior_share to be a probability"):
         Defensive(Normal(0.0), Normal(0.0), 1.5)
     assert Defensive(Normal(0.0), Normal(0.0, ("a", "b")), 0.1).names == ("a", "b")
 

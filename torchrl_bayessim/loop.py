@@ -41,7 +41,7 @@ from .inference.physics_posterior import PhysicsPosterior
 from .inference.refinement import PosteriorRefinement
 from .ray_collectors import RayCollectors
 from .robots import RealSystem, comparable
-from .sources import Defensive
+from .sources import Defensive, check_prior_share
 from .summaries import SummaryStatistics
 from .trajectories import concatenate, next_key
 from .transforms.domain_randomizer import DomainRandomizer
@@ -123,7 +123,7 @@ class SimToRealLoop:
         checkpoint_every: Updates between two checkpoints. Episodes begin anew after each.
         collectors: On Ray, to simulate there with as many environments as ``env`` has, which then
             only tells what is simulated. The caller shuts them down.
-        progress: Whether to show progress bars.
+        progress: Whether to show progress bars; those of fits as ``fit_options`` say, if they do.
 
     Raises:
         TypeError: For a count that is no whole number.
@@ -170,8 +170,7 @@ class SimToRealLoop:
             check_count(name, value)
         for name, value in {"updates": updates, "shared_batches": shared_batches}.items():
             check_count(name, value, least=0)
-        if not 0 <= prior_share <= 1:
-            raise ValueError(message("prior_share to be a probability, 0 to 1", prior_share))
+        check_prior_share(prior_share)
         self.settings |= {
             "updates": updates,
             "shared_batches": shared_batches,
@@ -298,7 +297,7 @@ class SimToRealLoop:
             return summary
 
         observed = torch.cat([entry["summary"] for entry in evidence], -1)
-        report = self.refinement.refine(simulate, observed, key=key)
+        report = self.refinement.refine(simulate, observed, key=key, progress=self.progress)
         state["fit"] = dataclasses.asdict(report)
         if shared:  # collected with this very policy: the learner's first update of the round
             self._update(concatenate(shared))

@@ -8,9 +8,19 @@ https://arxiv.org/abs/1906.01728) draws from the posterior instead.
 
 from __future__ import annotations
 
-__all__ = ["Defensive", "Empirical", "Grid", "Source", "check_source", "draw", "names_of"]
+__all__ = [
+    "Defensive",
+    "Empirical",
+    "Grid",
+    "Source",
+    "check_prior_share",
+    "check_source",
+    "draw",
+    "names_of",
+]
 
 import inspect
+from numbers import Real
 from typing import Any, Protocol
 
 import torch
@@ -87,6 +97,16 @@ def check_source(source: object) -> None:
         raise TypeError(message("a source with sample(shape)", type(source).__name__, hint=hint))
 
 
+def check_prior_share(share: float) -> None:
+    """Refuse what is no probability of a prior draw.
+
+    Raises:
+        ValueError: It is no number between 0 and 1.
+    """
+    if not (isinstance(share, Real) and 0 <= share <= 1):
+        raise ValueError(message("prior_share to be a probability, 0 to 1", share))
+
+
 def names_of(source: object) -> tuple[str, ...] | None:
     """Return the parameters' names if the source knows them."""
     names = getattr(source, "names", None)
@@ -114,8 +134,7 @@ class Defensive:
     """
 
     def __init__(self, source: Source, prior: Source, prior_share: float) -> None:
-        if not 0 <= prior_share <= 1:
-            raise ValueError(message("a probability of a prior draw in [0, 1]", prior_share))
+        check_prior_share(prior_share)
         names = [names_of(source), names_of(prior)]
         if None not in names and names[0] != names[1]:
             raise ValueError(message(f"a prior over {names[0]}, as the source", names[1]))

@@ -30,7 +30,7 @@ from .inference.fit import FitReport
 from .inference.refinement import PosteriorRefinement
 from .remote_source import PolicyWithSource, push_source
 from .robots import RealSystem, comparable
-from .sources import Defensive, Source
+from .sources import Defensive, Source, check_prior_share
 from .summaries import SummaryStatistics
 from .transforms.domain_randomizer import DomainRandomizer
 
@@ -114,6 +114,7 @@ class PosteriorTrainerHook(TrainerHookBase):
     ) -> None:
         check_count("batches per interval", interval, least=2)
         check_count("episodes", episodes)
+        check_prior_share(prior_share)
         if robot.recorded:
             raise ValueError(
                 message("a robot that runs the policy", "recorded logs", hint="SimToRealLoop")

@@ -352,6 +352,35 @@ def test_epochs_and_batches_are_positive(options):
         fit(MixtureDensityPosterior(prior, 1), data, progress=False, **options)
 
 
+def test_pairs_may_lie_in_rows_and_columns():
+    data = linear_gaussian(40)
+    data["summary"][[3, 7, 11], 0] = torch.nan
+    with pytest.warns(UserWarning, match="3 of 40 simulations are not finite: left out"):
+        expected = short_fit(posterior(), data)
+    with pytest.warns(UserWarning, match="3 of 40 simulations are not finite: left out"):
+        report = short_fit(posterior(), data.reshape(8, 5))
+    assert report.train == expected.train
+
+
+def test_counts_are_summaries_and_gradients_of_pairs_are_not_asked_for():
+    data = linear_gaussian(40)
+    data["summary"] = data["summary"].round()
+    expected = short_fit(posterior(), data)
+    whole = data.clone().set("summary", data["summary"].long())
+    assert short_fit(posterior(), whole).train == expected.train
+    grown = TensorDict({k: v.clone().requires_grad_() for k, v in data.items()}, [40])
+    assert short_fit(posterior(), grown).train == expected.train
+    assert whole["summary"].dtype == torch.long  # the caller's pairs are as they were
+    assert all(value.grad is None for value in grown.values())
+
+
+@pytest.mark.parametrize("key", ["theta", "summary"])
+def test_pairs_hold_vectors(key):
+    data = linear_gaussian(40)
+    with pytest.raises(ValueError, match=rf"vectors in '{key}', shape \(N, size\), got \(40,\)"):
+        short_fit(posterior(), data.set(key, data[key][:, 0]))
+
+
 def test_without_pairs_there_is_nothing_to_fit_either():
     empty = linear_gaussian(4)[:0]
     with pytest.raises(ValueError, match="at least one pair, got 'none'"):

@@ -1,6 +1,7 @@
 import re
 import warnings
 
+import numpy as np
 import pytest
 import torch
 from torchrl.envs import Compose, TransformedEnv
@@ -217,3 +218,44 @@ def test_sizes_are_checked_at_construction():
         PosteriorRefinement(prior, simulations=0)
     with pytest.raises(ValueError, match="components to be positive, got 0"):
         MixtureDensityPosterior(prior, 3, components=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"margin": -1.0}, "a finite margin of 0 or more, got -1.0"),
+        ({"margin": float("nan")}, "a finite margin of 0 or more, got nan"),
+        ({"margin": "1"}, "a finite margin of 0 or more, got '1'"),
+        ({"prior_share": 7}, "prior_share to be a probability, 0 to 1, got 7"),
+        ({"fit_options": {"epoch": 3}}, r"an option of fit, got 'epoch'.*epochs \(did you mean"),
+    ],
+    ids=str,
+)
+def test_options_that_cannot_be_are_refused_at_construction(options, text):
+    with pytest.raises(ValueError, match=text):
+        PosteriorRefinement(BOX, **options)
+
+
+def test_a_distribution_without_names_is_no_prior():
+    with pytest.raises(TypeError, match=r"a prior with named parameters, got 'Normal'\. Try: Box"):
+        PosteriorRefinement(torch.distributions.Normal(0.0, 1.0))
+
+
+@pytest.mark.parametrize("kind", [list, np.asarray])
+def test_lists_and_arrays_may_be_observed(kind):
+    observed = noisy(BOX, 7)(torch.tensor([[0.4, 2.0]]))[0]
+    means = []
+    for x in (observed, kind(observed.tolist())):
+        made = refinement(simulations=64)
+        made.refine(noisy(BOX), x, key=(0,))
+        means.append(made.posterior.mean)
+    assert torch.equal(*means)
+
+
+def test_progress_bars_are_shown_as_the_options_say_or_else_as_asked(capsys):
+    shown = []
+    for options, asked in (({}, False), ({}, True), ({"progress": False}, True)):
+        made = refinement(simulations=32, fit_options={"epochs": 1} | options)
+        made.refine(noisy(BOX), torch.zeros(4), key=(0,), progress=asked)
+        shown.append("epoch" in capsys.readouterr().err)
+    assert shown == [False, True, False]

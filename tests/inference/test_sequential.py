@@ -1,5 +1,6 @@
 import itertools
 
+import numpy as np
 import pytest
 import torch
 
@@ -75,7 +76,7 @@ def test_what_was_observed_is_checked_before_simulating(observed):
     def never(theta):
         raise AssertionError
 
-    with pytest.raises(ValueError, match="finite summaries of the real trajectories"):
+    with pytest.raises(ValueError, match=r"finite statistics of|trajectories, shape \(L,\) or"):
         next(sequential(never, BOX, observed, rounds=1, simulations=100, **QUICK))
 
 
@@ -257,3 +258,30 @@ def test_networks_are_averaged():
     one, three = components
     assert three.logits.numel() == 3 * one.logits.numel()
     assert torch.equal(three.loc[..., : one.loc.shape[-2], :], one.loc)
+
+
+@pytest.mark.parametrize("observed", [[1.0], [[1]], np.ones((1, 1)), torch.ones(1)], ids=repr)
+def test_lists_and_arrays_may_be_observed(observed):
+    options = {"rounds": 1, "simulations": 64, **QUICK}
+    (turn,), (same,) = (sequential(square(0), BOX, x, **options) for x in (observed, OBSERVED))
+    assert torch.equal(turn.posterior.mixture.loc, same.posterior.mixture.loc)
+
+
+@pytest.mark.parametrize(
+    ("bad", "error", "text"),
+    [
+        ({"observed": "x"}, TypeError, "numbers, the summaries of real trajectories, got 'str'"),
+        ({"observed": []}, ValueError, r"trajectories, shape \(L,\) or \(n, L\), got \(0,\)"),
+        ({"prior": torch.distributions.Normal(0.0, 1.0)}, TypeError, "named param.*got 'Normal'"),
+        ({"prior_share": 7}, ValueError, "prior_share to be a probability, 0 to 1, got 7"),
+        ({"epoch": 3}, ValueError, r"an option of fit, got 'epoch'.*epochs \(did you mean"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_is_refused_before_simulating(bad, error, text):
+    def never(theta):
+        raise AssertionError("simulated")
+
+    options = {"prior": BOX, "observed": OBSERVED, "rounds": 1, "simulations": 9} | bad
+    with pytest.raises(error, match=text):
+        next(sequential(never, options.pop("prior"), options.pop("observed"), **options))

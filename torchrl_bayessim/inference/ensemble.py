@@ -7,7 +7,7 @@ Pritzel & Blundell, 2017, arXiv:1612.01474).
 
 from __future__ import annotations
 
-__all__ = ["PosteriorMaker", "average", "learn", "pairs_of"]
+__all__ = ["PosteriorMaker", "average", "learn", "pairs_of", "real_summaries"]
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -74,8 +74,39 @@ def pairs_of(theta: Tensor, summary: Tensor) -> TensorDict:
     if not isinstance(got, tuple) or len(got) != 2 or got[0] != len(theta):
         raise ValueError(message(f"one summary per simulation, shape ({len(theta)}, L)", got))
     # counts are statistics too
-    summary = summary if summary.is_floating_point() else summary.to(theta.dtype)
+    summary = summary.detach() if summary.is_floating_point() else summary.to(theta.dtype)
     return TensorDict({"theta": theta, "summary": summary}, batch_size=[len(theta)])
+
+
+def real_summaries(observed: Any) -> Tensor:
+    """Return what was observed, lists and NumPy arrays too, as a tensor ``(L,)`` or ``(n, L)``.
+
+    Raises:
+        TypeError: It is not made of numbers.
+        ValueError: It has another shape, or values that are not finite.
+
+    Example:
+        >>> real_summaries([[0.25, 1.0]])
+        tensor([[0.2500, 1.0000]])
+    """
+    try:
+        observed = torch.as_tensor(observed).detach()
+    except (TypeError, ValueError, RuntimeError):
+        got = type(observed).__name__
+        raise TypeError(message("numbers, the summaries of real trajectories", got)) from None
+    if observed.ndim not in {1, 2} or not observed.numel():
+        expected = "summaries of the real trajectories, shape (L,) or (n, L)"
+        raise ValueError(message(expected, tuple(observed.shape)))
+    bad = ~torch.atleast_2d(observed).isfinite()
+    if bad.any():
+        raise ValueError(
+            message(
+                "finite statistics of the real trajectories",
+                f"NaN or infinity in statistics {bad.any(0).nonzero().flatten().tolist()}",
+                hint="drop the trajectories that diverged, or repair their logs",
+            )
+        )
+    return observed
 
 
 def average(members: Sequence[TruncatedGaussianMixture]) -> TruncatedGaussianMixture:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-__all__ = ["FitReport", "fit", "select_lengthscale", "usable_pairs"]
+__all__ = ["FitReport", "check_fit_options", "fit", "select_lengthscale", "usable_pairs"]
 
 import copy
+import inspect
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -116,7 +117,8 @@ def fit(
 
     Args:
         posterior: Changed in place.
-        data: Batch size ``(N,)``; ``"theta"`` ``(N, D)``, ``"summary"`` ``(N, L)``.
+        data: Batch size ``(N,)``, or any other, which is taken for one row of pairs; ``"theta"``
+            ``(N, D)``, ``"summary"`` ``(N, L)``, of which counts become floats.
         epochs: At most so many passes.
         batch_size: Pairs per step.
         lr: Highest learning rate.
@@ -136,6 +138,7 @@ def fit(
     """
     if not isinstance(data, TensorDictBase):
         raise TypeError(message("pairs in a TensorDict of batch size (N,)", type(data).__name__))
+    data = _in_floats(data, posterior.theta_key, posterior.summary_key)
     if not 0 < validation_fraction < 1:
         raise ValueError(message("a validation_fraction between 0 and 1", validation_fraction))
     for name, value in {"epochs": epochs, "batch_size": batch_size}.items():
@@ -169,6 +172,33 @@ def fit(
         progress=progress,
     )
     return FitReport(len(rows), dropped, len(trace[0]), *trace)
+
+
+def check_fit_options(options: Iterable[str]) -> None:
+    """Refuse names that :func:`fit` has no option of.
+
+    Raises:
+        ValueError: There is one.
+    """
+    known = [p.name for p in inspect.signature(fit).parameters.values() if p.kind == p.KEYWORD_ONLY]
+    for name in options:
+        if name not in known:
+            raise ValueError(message("an option of fit", name, available=known))
+
+
+def _in_floats(data: TensorDictBase, *keys: NestedKey) -> TensorDictBase:
+    """Return pairs of batch size ``(N,)``, as floats of which no gradient is asked."""
+    data = data.copy() if data.ndim == 1 else data.reshape(-1)
+    if any(value.requires_grad for value in data.values(include_nested=True, leaves_only=True)):
+        data = data.detach()
+    for key in keys:
+        value = data.get(key, None)
+        if value is not None and (value.ndim != 2 or not value.shape[1]):
+            expected = f"vectors in {key!r}, shape (N, size)"
+            raise ValueError(message(expected, tuple(value.shape), hint="unsqueeze(-1)"))
+        if value is not None and not value.is_floating_point():
+            data.set(key, value.to(torch.get_default_dtype()))
+    return data
 
 
 def _check_pairs(posterior: MixtureDensityPosterior, pairs: Rows) -> None:
@@ -221,6 +251,7 @@ def select_lengthscale(
     if not isinstance(features, FourierFeatures):
         raise TypeError(message("a posterior over FourierFeatures", type(features).__name__))
     key = posterior.summary_key
+    data = _in_floats(data, posterior.theta_key, key)
     pairs, _ = usable_pairs(data, theta_key=posterior.theta_key, summary_key=key)
     network.standardize_inputs(pairs[key])
     some = torch.randperm(len(pairs), generator=generator(seed, "median"))[:500]

@@ -36,7 +36,7 @@ from .mixtures import Mixture
 from .network import Covariance, MixtureDensityNetwork
 from .physics_posterior import PhysicsPosterior
 from .pooling import pool
-from .priors import Prior
+from .priors import Prior, check_prior
 from .truncation import POINTS, TruncatedGaussianMixture
 
 Pooling = Literal["product", "mean"]
@@ -99,11 +99,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         out_key: NestedKey = "theta",
         seed: int = 0,
     ) -> None:
-        if not isinstance(prior, Prior):
-            hint = "BoxPrior or GaussianPrior"
-            raise TypeError(
-                message("a prior with named parameters", type(prior).__name__, hint=hint)
-            )
+        check_prior(prior)
         check_count("summary_dim", summary_dim)
         if isinstance(features, str) and features not in MAPS:
             raise ValueError(message("the name of a feature map", features, available=MAPS))

@@ -13,7 +13,7 @@ A prior is a torch :class:`~torch.distributions.Distribution` with event shape `
 
 from __future__ import annotations
 
-__all__ = ["BoxPrior", "GaussianPrior", "Prior"]
+__all__ = ["BoxPrior", "GaussianPrior", "Prior", "check_prior"]
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -107,6 +107,17 @@ class Prior(Distribution):
                     tuple(theta.shape),
                 )
             )
+
+
+def check_prior(prior: object) -> None:
+    """Refuse what is no prior with named parameters, such as a torch distribution.
+
+    Raises:
+        TypeError: It is none.
+    """
+    if not isinstance(prior, Prior):
+        hint = "BoxPrior or GaussianPrior"
+        raise TypeError(message("a prior with named parameters", type(prior).__name__, hint=hint))
 
 
 _LARGEST = 1e18  # of bounds, means and deviations

@@ -11,23 +11,24 @@ from __future__ import annotations
 
 __all__ = ["PosteriorRefinement"]
 
+import math
 import warnings
 from collections.abc import Callable, Mapping
+from numbers import Real
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from ..counts import check_count
 from ..errors import message
 from ..randomness import seed_from
-from ..sources import Defensive, draw
-from .ensemble import PosteriorMaker, learn, pairs_of
-from .fit import FitReport
+from ..sources import Defensive, check_prior_share, draw
+from .ensemble import PosteriorMaker, learn, pairs_of, real_summaries
+from .fit import FitReport, check_fit_options
 from .misspecification import doubts
 from .physics_posterior import PhysicsPosterior
 from .posterior import MixtureDensityPosterior
-from .priors import BoxPrior, Prior
+from .priors import BoxPrior, Prior, check_prior
 from .proposals import focus, importance_weights
 from .truncation import TruncatedGaussianMixture
 
@@ -37,11 +38,13 @@ class PosteriorRefinement:
 
     Args:
         prior: What is believed before any data.
-        simulations: Pairs per refinement, where it simulates itself.
+        simulations: Pairs per refinement, where it simulates itself. Fewer than 50 are too few to
+            tell whether the real summary lies apart, and nothing is said of it then.
         networks: Networks fitted each time, on other splits of the pairs; the posterior is their
             average, which is less sure where they disagree.
         make_posterior: ``(prior, summary size)`` to a fresh network; a default one if omitted.
-        margin: Widening of the box around the last posterior, see :func:`.proposals.focus`.
+        margin: Widening of the box around the last posterior, as a share of it: see
+            :func:`.proposals.focus`.
         prior_share: Share of prior draws where importance weights are used; bounds them by its
             inverse.
         seed: Same seed, same refinements.
@@ -49,6 +52,11 @@ class PosteriorRefinement:
 
     Attributes:
         posterior: The last posterior; ``None`` before the first refinement.
+
+    Raises:
+        TypeError: The prior is none of :mod:`.priors`, or a count is no whole number.
+        ValueError: For counts that are too small, a margin that is negative or not finite, a
+            ``prior_share`` that is no probability, or options that :func:`.fit.fit` does not have.
 
     Example:
         >>> prior = BoxPrior({"a": (-1.0, 1.0)})
@@ -72,8 +80,13 @@ class PosteriorRefinement:
         seed: int = 0,
         fit_options: Mapping[str, Any] | None = None,
     ) -> None:
+        check_prior(prior)
         check_count("simulations", simulations, least=4)
         check_count("networks", networks)
+        if not (isinstance(margin, Real) and 0 <= margin < math.inf):
+            raise ValueError(message("a finite margin of 0 or more", margin))
+        check_prior_share(prior_share)
+        check_fit_options(fit_options or {})
         self.prior, self.simulations, self.networks = prior, simulations, networks
         self.make_posterior = make_posterior or MixtureDensityPosterior
         self.margin, self.prior_share, self.seed = margin, prior_share, seed
@@ -95,7 +108,12 @@ class PosteriorRefinement:
         }
 
     def refine(
-        self, simulate: Callable[[Tensor], Tensor], observed: Tensor, *, key: tuple[int | str, ...]
+        self,
+        simulate: Callable[[Tensor], Tensor],
+        observed: Any,
+        *,
+        key: tuple[int | str, ...],
+        progress: bool = True,
     ) -> FitReport:
         """Simulate, fit and condition once; the result is :attr:`posterior`.
 
@@ -103,20 +121,28 @@ class PosteriorRefinement:
             simulate: Parameters ``(N, D)`` to summaries ``(N, L)``.
             observed: The real summary, shape ``(L,)``.
             key: What this refinement is: same key, same parameters are drawn.
+            progress: Whether the fits show progress bars, where ``fit_options`` do not say.
 
         Raises:
-            ValueError: ``observed`` is not finite; nothing is simulated then.
+            TypeError: ``observed`` is not made of numbers; nothing is simulated then.
+            ValueError: ``observed`` is not finite, or of another shape; nor then.
         """
-        _check_finite(observed)
+        observed = real_summaries(observed)
         theta = draw(self.proposal(), self.simulations, key=(self.seed, *key, "theta"))
-        return self.learn(theta, simulate(theta), observed, key=key)
+        return self.learn(theta, simulate(theta), observed, key=key, progress=progress)
 
     def proposal(self) -> Any:
         """Return the source that the parameters of the next pairs are to be drawn from."""
         return self._proposal()[1]
 
     def learn(
-        self, theta: Tensor, summary: Tensor, observed: Tensor, *, key: tuple[int | str, ...]
+        self,
+        theta: Tensor,
+        summary: Tensor,
+        observed: Any,
+        *,
+        key: tuple[int | str, ...],
+        progress: bool = True,
     ) -> FitReport:
         """Fit and condition once, on pairs that were simulated elsewhere.
 
@@ -129,8 +155,9 @@ class PosteriorRefinement:
             observed: The real summary, shape ``(L,)``, or those of n independent trajectories,
                 shape ``(n, L)``.
             key: What this refinement is.
+            progress: Whether the fits show progress bars, where ``fit_options`` do not say.
         """
-        _check_finite(observed)
+        observed = real_summaries(observed)
         local, proposal = self._proposal()
         pairs = pairs_of(theta, summary)
         if proposal is not local:
@@ -142,7 +169,7 @@ class PosteriorRefinement:
             observed,
             make_posterior=self.make_posterior,
             seeds=[seed_from(self.seed, *key, "fit", i) for i in range(self.networks)],
-            fit_options=self.fit_options,
+            fit_options={"progress": progress} | self.fit_options,
         )
         for doubt in doubts(summary, observed, self.posterior):
             warnings.warn(doubt, stacklevel=2)
@@ -188,16 +215,3 @@ class PosteriorRefinement:
             diagonal=state["diagonal"],
         )
         self.posterior = PhysicsPosterior(mixture, local)
-
-
-def _check_finite(observed: Tensor) -> None:
-    bad = ~torch.atleast_2d(observed).isfinite()
-    if bad.any():
-        statistics = bad.any(0).nonzero().flatten().tolist()
-        raise ValueError(
-            message(
-                "finite statistics of the real trajectories",
-                f"NaN or infinity in statistics {statistics}",
-                hint="drop the trajectories that diverged, or repair their logs",
-            )
-        )

@@ -20,13 +20,13 @@ from torch import Tensor
 from ..counts import check_count
 from ..errors import SimulationError, message
 from ..randomness import seed_from
-from ..sources import Defensive, draw
-from .ensemble import learn, pairs_of
-from .fit import FitReport
+from ..sources import Defensive, check_prior_share, draw
+from .ensemble import learn, pairs_of, real_summaries
+from .fit import FitReport, check_fit_options
 from .misspecification import doubts
 from .physics_posterior import PhysicsPosterior
 from .posterior import MixtureDensityPosterior
-from .priors import Prior
+from .priors import Prior, check_prior
 from .proposals import (
     HighestDensityPrior,
     Proposal,
@@ -64,7 +64,7 @@ class SequentialRound:
 def sequential(
     simulator: Callable[[Tensor], Tensor],
     prior: Prior,
-    observed: Tensor,
+    observed: Any,
     *,
     rounds: int,
     simulations: int,
@@ -80,7 +80,7 @@ def sequential(
     Args:
         simulator: Parameters ``(N, D)`` to summaries ``(N, L)``.
         prior: The prior.
-        observed: Summaries of the real trajectories, ``(n, L)``.
+        observed: Summaries of the real trajectories, ``(n, L)``, or of one, ``(L,)``.
         rounds: Number of rounds.
         simulations: Simulations per round.
         correction: See :mod:`.proposals`. ``"importance"`` and ``"truncated"`` train on the pairs
@@ -97,10 +97,11 @@ def sequential(
         One :class:`SequentialRound` after another.
 
     Raises:
-        TypeError: On the first turn, for counts that are no whole numbers.
-        ValueError: On the first turn, for an unknown correction, counts that are too small,
-            ``observed`` that is not finite, or a simulator that does not give one summary per
-            simulation.
+        TypeError: On the first turn, for counts that are no whole numbers, a prior that is none of
+            :mod:`.priors`, or ``observed`` that is not made of numbers.
+        ValueError: On the first turn, for an unknown correction or option, counts that are too
+            small, a share that is no probability, ``observed`` that is not finite, or a simulator
+            that does not give one summary per simulation.
 
     Warns if the real summaries lie apart from all simulated ones, or the posterior at an edge: see
     :mod:`.misspecification`.
@@ -112,9 +113,10 @@ def sequential(
         raise ValueError(
             message("a correction", correction, available=["importance", "truncated", "analytic"])
         )
-    if observed.ndim not in {1, 2} or not observed.isfinite().all():
-        expected = "finite summaries of the real trajectories, shape (n, L)"
-        raise ValueError(message(expected, observed.tolist()))
+    check_prior(prior)
+    check_prior_share(prior_share)
+    check_fit_options(fit_options)
+    observed = real_summaries(observed)
     proposal: Any = prior
     posterior: PhysicsPosterior | None = None
     history: list[tuple[Proposal, TensorDict]] = []
