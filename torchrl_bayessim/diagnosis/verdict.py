@@ -4,7 +4,8 @@ A goodness-of-fit test always rejects in the end, so the verdict weighs how larg
 how much of it the effects explain, not only whether it is significant::
 
     none           nothing significant, or an excess below 5 % of the noise floor
-    named          effects explain at least 80 %, and what is left is not significant, or 2 %
+    named          effects explain at least 80 %, and what is left is not significant, or 2 % and
+                   no more than the noise
     named_partial  effects explain at least 40 %; the rest is located. Or 80 % on validation runs,
                    where test runs hardly show the gap
     ambiguous      effects of different kinds explain the data equally well
@@ -32,6 +33,7 @@ _NEGLIGIBLE = 0.05  # of the noise floor: an excess that no one would chase
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
 _UNEVEN = 5.0  # standard errors; or that what is left varies more between segments than noise
 _SHOWN = 1.2  # mean squared innovation of runs that show a gap
+_NOISE_AGAIN = 2.0  # mean squared innovation: as much again as the noise
 _ALL, _NAMED, _PARTIAL = 0.98, 0.8, 0.4
 
 
@@ -60,7 +62,9 @@ def conclude(
         significant and unevenness(selection.best) > _UNEVEN
     )
     visible = measured.excess_ci[0] > 0 and unlike_noise
-    left = measured.remainder_ci[0] > _NEGLIGIBLE and measured.explained < _ALL
+    # of a large gap, 2 % may be ten times the noise: proof that the law is another one
+    nearly_all = measured.explained >= _ALL and measured.effects <= _NOISE_AGAIN
+    left = measured.remainder_ci[0] > _NEGLIGIBLE and not nearly_all
     validated = _validated(selection)
     perhaps_nothing = measured.explained_ci[0] <= 0 and validated < _PARTIAL
     unsaid = measured.explained < _PARTIAL or perhaps_nothing
