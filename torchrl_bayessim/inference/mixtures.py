@@ -17,10 +17,16 @@ __all__ = [
 ]
 
 import math
+import warnings
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+from ..errors import message
+
+_ROUNDING = 1e-9  # of the widest variance
+_THINNEST = 1e-12
 
 
 class Mixture(NamedTuple):
@@ -105,12 +111,12 @@ def multiply(first: Mixture, second: Mixture) -> Mixture:
     cov_1, cov_2 = torch.broadcast_tensors(
         first.covariance.unsqueeze(-3), second.covariance.unsqueeze(-4)
     )
-    total = torch.linalg.cholesky(cov_1 + cov_2)
+    total = _cholesky(cov_1 + cov_2)
     overlap = component_log_prob(loc_1, loc_2.unsqueeze(-2), total.unsqueeze(-3)).squeeze(-1)
     logits = first.logits.unsqueeze(-1) + second.logits.unsqueeze(-2) + overlap
     gain = torch.cholesky_solve(cov_2, total).mT  # Sigma_j (Sigma_i + Sigma_j)^-1
     loc = loc_2 + (gain @ (loc_1 - loc_2).unsqueeze(-1)).squeeze(-1)
-    scale = torch.linalg.cholesky(_symmetric(gain @ cov_1))
+    scale = _cholesky(_symmetric(gain @ cov_1))
     return Mixture(logits.flatten(-2), loc.flatten(-3, -2), scale.flatten(-4, -3))
 
 
@@ -150,7 +156,7 @@ def divide(mixture: Mixture, mean: Tensor, covariance: Tensor, *, widest: Tensor
     precision_0 = torch.linalg.inv(covariance).unsqueeze(-3)
     shift = precision @ mixture.loc.unsqueeze(-1) - precision_0 @ mean[..., None, :, None]
     # in coordinates where the widest covariance is the identity
-    unit = torch.linalg.cholesky(widest)
+    unit = _cholesky(widest)
     values, vectors = torch.linalg.eigh(_symmetric(unit.mT @ (precision - precision_0) @ unit))
     bad = values < 1 - 1e-9
     values = values.clamp_min(1.0)
@@ -159,10 +165,10 @@ def divide(mixture: Mixture, mean: Tensor, covariance: Tensor, *, widest: Tensor
     stay = torch.linalg.solve(back, mixture.loc.unsqueeze(-1))
     solved = (back.mT @ shift) / values.unsqueeze(-1)
     loc = (back @ torch.where(bad.unsqueeze(-1), stay, solved)).squeeze(-1)
-    scale = torch.linalg.cholesky(_symmetric(back @ (back / values.unsqueeze(-2)).mT))
+    scale = _cholesky(_symmetric(back @ (back / values.unsqueeze(-2)).mT))
     own = -mixture.scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     own = own - 0.5 * mixture.loc.shape[-1] * math.log(2 * math.pi)
-    scale_0 = torch.linalg.cholesky(covariance)[..., None, None, :, :]
+    scale_0 = _cholesky(covariance)[..., None, None, :, :]
     divisor = component_log_prob(mixture.loc, mean[..., None, None, :], scale_0).squeeze(-1)
     raised = component_log_prob(mixture.loc, loc.unsqueeze(-2), scale.unsqueeze(-3)).squeeze(-1)
     repaired = bad.any(-1)
@@ -192,11 +198,11 @@ def reduce(mixture: Mixture, components: int) -> Mixture:
         cost = torch.cat([torch.cat([cost[rest][:, rest], row[:, :-1].mT], 1), row])
         cost.fill_diagonal_(torch.inf)
     weight, loc, cov = parts
-    return Mixture(weight.log().log_softmax(-1), loc, torch.linalg.cholesky(cov))
+    return Mixture(weight.log().log_softmax(-1), loc, _cholesky(cov))
 
 
 def _merge(weight: Tensor, loc: Tensor, cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    mean, covariance = moment_match(Mixture(weight.log(), loc, torch.linalg.cholesky(cov)))
+    mean, covariance = moment_match(Mixture(weight.log(), loc, _cholesky(cov)))
     return weight.sum(0, keepdim=True), mean[None], covariance[None]
 
 
@@ -207,8 +213,44 @@ def _merge_cost(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> Tensor
     share = (weight / total)[..., None, None]
     between = loc - second[1]
     outer = share * (1 - share) * between[..., None] * between[..., None, :]
-    cost = total * torch.logdet(share * cov + (1 - share) * second[2] + outer)
-    return cost - weight * torch.logdet(cov) - second[0] * torch.logdet(second[2])
+    cost = total * _log_det(share * cov + (1 - share) * second[2] + outer)
+    return cost - weight * _log_det(cov) - second[0] * _log_det(second[2])
+
+
+def _cholesky(matrix: Tensor) -> Tensor:
+    """Return the lower factor of covariances ``(*, D, D)``.
+
+    Where rounding has left one indefinite, as it does where a component has collapsed in some
+    direction, it is widened to `_THINNEST` of its widest variance, with a warning.
+
+    Raises:
+        ValueError: One is indefinite by more than rounding.
+    """
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    if not failed.any():
+        return factor
+    bad = failed > 0
+    values, vectors = torch.linalg.eigh(_symmetric(matrix))
+    widest, rounding = values.amax(-1, keepdim=True), torch.finfo(matrix.dtype).eps
+    if (values < -max(_ROUNDING, 1e3 * rounding) * widest)[bad].any():
+        expected = "covariances that are positive definite"
+        raise ValueError(message(expected, f"a variance of {values[bad].amin().item():.3g}"))
+    values = values.maximum(max(_THINNEST, 1e2 * rounding) * widest)
+    widened = (vectors * values.unsqueeze(-2)) @ vectors.mT
+    text = f"{int(bad.sum())} of {bad.numel()} covariances are indefinite by rounding: widened"
+    warnings.warn(text, stacklevel=3)
+    safe = torch.where(
+        bad[..., None, None], _symmetric(widened), torch.eye(matrix.shape[-1]).to(matrix)
+    )
+    return torch.where(bad[..., None, None], torch.linalg.cholesky(safe), factor)
+
+
+def _log_det(covariance: Tensor) -> Tensor:
+    found = torch.logdet(covariance)
+    if not found.isfinite().all():
+        safe = 2 * _cholesky(covariance).diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        found = torch.where(found.isfinite(), found, safe)
+    return found
 
 
 def _symmetric(matrix: Tensor) -> Tensor:
