@@ -18,7 +18,8 @@ from torchrl_bayessim.evaluation import evaluate, successes
 from torchrl_bayessim.inference.refinement import PosteriorRefinement
 from torchrl_bayessim.influence import check_influence
 from torchrl_bayessim.randomness import isolated
-from torchrl_bayessim.robots import SurrogateRobot, comparable
+from torchrl_bayessim.real_trajectories import comparable
+from torchrl_bayessim.robots import SurrogateRobot
 from torchrl_bayessim.simulate import simulate
 from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.summaries import SummaryStatistics

@@ -31,6 +31,7 @@ LAYERS = [
         "simulate",
         "ray_collectors",
         "ray_worker",
+        "real_trajectories",
         "robots",
         "influence",
         "excitation",

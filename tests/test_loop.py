@@ -54,10 +54,10 @@ def small(prior, size):
     return MixtureDensityPosterior(prior, size, components=1)
 
 
-def make_env(width=6, *, prior=PRIOR):
+def make_env(width=6, *, prior=PRIOR, limit=50):
     randomizer = DomainRandomizer(prior)
     simulator = CartPoleEnv(width)
-    transforms = Compose(physics(), randomizer, StepCounter(50), RewardSum())
+    transforms = Compose(physics(), randomizer, StepCounter(limit), RewardSum())
     return TransformedEnv(simulator, transforms), randomizer
 
 
@@ -409,6 +409,87 @@ def test_measurements_of_another_size_are_refused_before_simulating(entry):
         list(make_loop(robot=robot))
 
 
+def dropping(*keys):
+    return lambda real: real.exclude(*keys)
+
+
+def masked(change):
+    return lambda real: real.set("mask", change(real["mask"]))
+
+
+ANSWERS = {
+    "nothing": (lambda real: None, TypeError, "in a TensorDict, got 'NoneType'"),
+    "a dictionary": (lambda real: real.to_dict(), TypeError, "in a TensorDict, got 'dict'"),
+    "one dimension": (lambda real: real[0], ValueError, r"trajectories \[n, T\] .* got \(10,\)"),
+    "three dimensions": (lambda real: real[None], ValueError, r"\[n, T\] .* got \(1, 2, 10\)"),
+    "no episode": (lambda real: real[:0], ValueError, r"\[n, T\] .* got \(0, 10\)"),
+    "no mask": (
+        dropping("mask"),
+        ValueError,
+        r"with an entry, got 'mask'.*first_trajectories",
+    ),
+    "no observation": (dropping("observation"), ValueError, "with an entry, got 'observation'"),
+    "no action": (dropping("action"), ValueError, "with an entry, got 'action'"),
+    "no next": (
+        dropping(("next", "observation")),
+        ValueError,
+        r"""with an entry, got "\('next', 'observation'\)".""",
+    ),
+    "no done": (dropping(("next", "done")), ValueError, r"""got "\('next', 'done'\)".*Available"""),
+    "float mask": (masked(torch.Tensor.float), TypeError, "booleans in 'mask', got 'torch.float32"),
+    "wide mask": (
+        masked(lambda mask: mask.unsqueeze(-1)),
+        ValueError,
+        r"a 'mask' of shape \(2, 10\), got \(2, 10, 1\)",
+    ),
+    "empty mask": (
+        masked(torch.zeros_like),
+        ValueError,
+        "at least one step each, got 'none that counts in trajectory 0'",
+    ),
+    "indices": (
+        lambda real: real.set("action", real["action"].argmax(-1)),
+        ValueError,
+        r"one-hot actions or torques.*got 'indices of shape \(2, 10\)'.*categorical_action_enc",
+    ),
+    "matrices": (
+        lambda real: real.set("observation", real["observation"].unsqueeze(-1)),
+        ValueError,
+        r"4 columns of 'observation', as the simulator has, got 'shape \(4, 1\) from the robot'",
+    ),
+    "a wide end": (
+        lambda real: real.set(("next", "done"), real["next", "done"].expand(-1, -1, 2)),
+        ValueError,
+        r"one boolean per step in \('next', 'done'\), got 'torch.bool of shape \(2, 10, 2\)'",
+    ),
+}
+
+
+@pytest.mark.parametrize("answer", ANSWERS)
+def test_what_a_robot_may_answer(answer):
+    change, error, text = ANSWERS[answer]
+    loop = make_loop(robot=Bringing(change))
+    with pytest.raises(error, match=text):
+        list(loop)
+    assert loop.state_dict()["loop"]["evidence"] == []
+
+
+def test_a_robot_need_not_know_rewards():
+    (turn,) = make_loop(robot=Bringing(dropping(("next", "reward"))), rounds=1, updates=1)
+    assert turn.posterior.stddev.isfinite().all()
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+@pytest.mark.parametrize("shared", [0, 1])
+def test_simulations_that_a_time_limit_cuts_before_the_real_episodes_end(recorded, shared):
+    env, randomizer = make_env(limit=6)
+    robot = RecordedLogs(logs()) if recorded else None
+    loop = make_loop(env, randomizer, robot=robot, shared_batches=shared)
+    text = r"may last the 10 steps of real ones, got '\d of 6 cut, after 6 steps.*StepCounter"
+    with pytest.raises(ValueError, match=text):
+        list(loop)
+
+
 def test_a_robot_that_did_fewer_episodes_is_compared_with_as_many():
     robot = Bringing(lambda real: real[:1])
     (turn,) = make_loop(robot=robot, rounds=1, shared_batches=9)
@@ -435,7 +516,7 @@ def test_real_values_that_are_not_finite_are_refused_before_simulating():
     env, randomizer = make_env()
     learner = Recorder(env)
     loop = make_loop(env, randomizer, learner=learner, robot=Bringing(broken))
-    with pytest.raises(ValueError, match="finite statistics of the real trajectories"):
+    with pytest.raises(ValueError, match=r"finite values of .*'observation'.*tory 1 at step 3"):
         list(loop)
     assert learner.batches == []
 
@@ -489,6 +570,18 @@ def test_logs_and_simulator_may_name_the_measurements_in_their_own_way():
     )
     (same,) = make_loop(robot=RecordedLogs(logs()), rounds=1, updates=1)
     assert torch.equal(turn.posterior.mixture.loc, same.posterior.mixture.loc)
+
+
+def test_logs_whose_names_the_simulator_or_the_statistics_lack_are_refused_at_once():
+    recorded = RecordedLogs(logs().rename_key_("action", "cmd"), action_key="cmd")
+    with pytest.raises(ValueError, match=r"with an entry, got 'action'\. Available: .*cmd.*renam"):
+        make_loop(robot=recorded)
+    read = SummaryStatistics(moments, action_key="cmd")
+    with pytest.raises(ValueError, match=r"an action that .* has, got 'cmd'\. Available: action\."):
+        make_loop(robot=recorded, statistics=read)
+    read = SummaryStatistics(moments, observation_key="joints")
+    with pytest.raises(ValueError, match=r"an observation that .*, got 'joints'\. Available: obs"):
+        make_loop(robot=make_robot(), statistics=read)
 
 
 def test_environments_must_be_a_multiple_of_the_logs():

@@ -161,7 +161,9 @@ def test_logs_are_returned_as_they_are_whatever_is_asked():
 
 @pytest.mark.parametrize("name", ["observation", "action", ("next", "observation"), "mask"])
 def test_logs_without_an_entry_are_refused(name):
-    with pytest.raises(ValueError, match=r"logs with an entry.*Available: .*action|observation"):
+    with pytest.raises(
+        ValueError, match=r"real trajectories with an entry.*Available: .*(action|obs)"
+    ):
         RecordedLogs(pad([log(3)]).exclude(name))
 
 

@@ -3,7 +3,7 @@ import copy
 import pytest
 import torch
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import Compose, StepCounter, TransformedEnv
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
@@ -297,4 +297,46 @@ def test_robots_and_intervals_that_do_not_fit_are_refused():
     trainer, _, randomizer = direct()
     make_hook(randomizer, Watched(STEPS - 2)).register(trainer)
     with pytest.raises(ValueError, match=f"last the {STEPS} steps of simulated ones"):
+        trainer.train()
+
+
+class Answering(Watched):
+    """A robot whose answer is changed."""
+
+    def __init__(self, change):
+        super().__init__()
+        self.change = change
+
+    def rollouts(self, policy, **options):
+        return self.change(super().rollouts(policy, **options))
+
+
+ANSWERS = {
+    "nothing": (lambda real: None, TypeError, "in a TensorDict, got 'NoneType'"),
+    "three dimensions": (lambda real: real[None], ValueError, r"\[n, T\] of .* got \(1, 1, 8\)"),
+    "no action": (lambda real: real.exclude("action"), ValueError, "an entry, got 'action'"),
+    "no done": (lambda real: real.exclude(("next", "done")), ValueError, r"got .*'next', 'done'"),
+    "more columns": (
+        lambda real: real.set("action", torch.cat([real["action"]] * 2, -1)),
+        ValueError,
+        "2 columns of 'action', as the simulator has, got '4 from the robot'",
+    ),
+}
+
+
+@pytest.mark.parametrize("answer", ANSWERS)
+def test_what_a_robot_may_answer(answer):
+    change, error, text = ANSWERS[answer]
+    trainer, _, randomizer = direct()
+    make_hook(randomizer, Answering(change)).register(trainer)
+    with pytest.raises(error, match=text):
+        trainer.train()
+
+
+def test_a_trainer_whose_episodes_a_time_limit_cuts_before_the_real_ones_end():
+    trainer, _, randomizer = direct()
+    trainer.collector.env.append_transform(StepCounter(5))
+    make_hook(randomizer).register(trainer)
+    text = rf"may last the {STEPS} steps of real ones, got '{WIDTH} of {WIDTH} cut, after 5 steps"
+    with pytest.raises(ValueError, match=text):
         trainer.train()

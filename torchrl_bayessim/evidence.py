@@ -138,8 +138,10 @@ class EvidenceSimulator:
         policy.load_state_dict(entry["policy"])
         return self._summaries(policy, theta, trajectories=entry["episodes"], key=key)[0]
 
-    def replay(self, real: TensorDictBase, theta: Tensor, *, key: tuple[int | str, ...]) -> Tensor:
-        """Return the summaries under recorded actions, shape ``(N, L)``.
+    def replay(
+        self, real: TensorDictBase, theta: Tensor, *, key: tuple[int | str, ...]
+    ) -> tuple[Tensor, list[TensorDictBase]]:
+        """Return the summaries under recorded actions, shape ``(N, L)``, and the first batch.
 
         Environment i replays the actions of log i mod n, and is cut where that log ends.
         """
@@ -166,7 +168,8 @@ class EvidenceSimulator:
             prepare=prepare,
             trajectories=len(real),
             key=key,
-        )[0]
+            keep=1,
+        )
 
     def _summaries(
         self, policy: TensorDictModuleBase, theta: Tensor, *, steps: int | None = None, **asked: Any

@@ -40,7 +40,14 @@ from .inference.fit import FitReport
 from .inference.physics_posterior import PhysicsPosterior
 from .inference.refinement import PosteriorRefinement
 from .ray_collectors import RayCollectors
-from .robots import RealSystem, comparable
+from .real_trajectories import (
+    check_columns,
+    check_cut,
+    check_real,
+    comparable,
+    simulated_columns,
+)
+from .robots import RealSystem, RecordedLogs
 from .sources import Defensive, check_prior_share
 from .summaries import SummaryStatistics
 from .trajectories import concatenate, next_key
@@ -127,8 +134,10 @@ class SimToRealLoop:
 
     Raises:
         TypeError: For a count that is no whole number.
-        ValueError: For a count that is too small, or a ``prior_share`` that is no probability; in a
-            round, for a robot whose measurements or actions are not of the simulator's sizes.
+        ValueError: For a count that is too small, a ``prior_share`` that is no probability, or
+            statistics of what the simulator or the logs do not have; in a round, for a robot whose
+            answer lacks what they read or has other sizes than the simulator's, and for episodes
+            that are cut earlier on one side than on the other.
 
     Example::
 
@@ -197,10 +206,13 @@ class SimToRealLoop:
             statistics,
             randomizer,
             horizon=horizon,
-            keep=shared_batches,
+            keep=max(1, shared_batches),  # one is looked at
             collectors=collectors,
             progress=progress,
         )
+        self._columns = simulated_columns(env, statistics, replayed=robot.recorded)
+        if isinstance(robot, RecordedLogs):
+            self._check(robot.trajectories)
 
     @property
     def planned_frames(self) -> int:
@@ -258,7 +270,7 @@ class SimToRealLoop:
         state, policy = self._state, self.learner.policy
         key = (self.seed, "round", state["round"])
         real = self.robot.rollouts(policy, episodes=self.episodes, key=key)
-        self._check_sizes(real)
+        self._check(real)
         if not self.robot.recorded:
             real = comparable(real, horizon=self.horizon)
         evidence: list[Evidence] = [] if self.robot.recorded else state["evidence"]
@@ -270,17 +282,11 @@ class SimToRealLoop:
         kept = real.select(*self.statistics.in_keys, "mask", ("next", "reward"), strict=False)
         state |= {"evidence": [*evidence, new], "real": _flatten(kept)}
 
-    def _check_sizes(self, real: TensorDictBase) -> None:
-        """Refuse measurements and actions that are not those of the simulator."""
-        env = self._simulator.env
-        for key, known in (
-            (self.statistics.observation_key, env.full_observation_spec),
-            (self.statistics.action_key, env.full_action_spec),
-        ):
-            spec, value = known.get(key, None), real.get(key, None)
-            if spec is not None and value is not None and spec.shape[-1:] != value.shape[-1:]:
-                expected = f"{spec.shape[-1]} columns of {key!r}, as the simulator has"
-                raise ValueError(message(expected, f"{value.shape[-1]} from the robot"))
+    def _check(self, real: TensorDictBase) -> None:
+        """Refuse what the statistics cannot read, or what has other sizes than in the simulator."""
+        read = self.statistics.in_keys
+        check_real(real, read[:3] if self.robot.recorded else read)
+        check_columns(real, self._columns)
 
     def _infer(self) -> None:
         state, key = self._state, (self.seed, "round", self._state["round"])
@@ -288,12 +294,13 @@ class SimToRealLoop:
         shared: list[TensorDictBase] = []
 
         def simulate(theta: Tensor) -> Tensor:
+            real = _unflatten(state["real"])
             if self.robot.recorded:
-                return self._simulator.replay(
-                    _unflatten(state["real"]), theta, key=(*key, "evidence", 0)
-                )
-            summary, batches = self._simulator.policies(evidence, theta, key=(*key, "evidence"))
-            shared.extend(batches)
+                summary, batches = self._simulator.replay(real, theta, key=(*key, "evidence", 0))
+            else:
+                summary, batches = self._simulator.policies(evidence, theta, key=(*key, "evidence"))
+                shared.extend(batches[: self.shared_batches])
+            check_cut(batches[0], real)
             return summary
 
         observed = torch.cat([entry["summary"] for entry in evidence], -1)

@@ -7,7 +7,7 @@ once, whatever the policy.
 
 from __future__ import annotations
 
-__all__ = ["RealSystem", "RecordedLogs", "SurrogateRobot", "comparable"]
+__all__ = ["RealSystem", "RecordedLogs", "SurrogateRobot"]
 
 from collections.abc import Sequence
 from hashlib import blake2b
@@ -24,6 +24,7 @@ from .counts import check_count
 from .diverged import UndisturbedPolicy
 from .errors import SimulationError, message
 from .randomness import isolated, seed_from
+from .real_trajectories import check_real, first_not_finite
 from .sources import Grid
 from .trajectories import concatenate, first_trajectories, next_key
 from .transforms.domain_randomizer import DomainRandomizer, randomizers
@@ -45,7 +46,9 @@ class RealSystem(Protocol):
     ) -> TensorDictBase:
         """Return trajectories ``[episodes, T]`` with a ``"mask"``, made by ``policy``.
 
-        The policy explores, as it does in simulation: ``ExplorationType.RANDOM``.
+        They hold what the statistics read, and ``("next", "done")``; with ``("next", "reward")``
+        what the robot earned is known, too. The policy explores, as it does in simulation:
+        ``ExplorationType.RANDOM``.
         """
         ...
 
@@ -144,7 +147,8 @@ class SurrogateRobot:
                 )
             rows.append(batch.reshape(-1, batch.shape[-1]))
         real = first_trajectories(concatenate(rows)[:episodes])
-        lost = _not_finite(real, [*self.measured, *(next_key(entry) for entry in self.measured)])
+        following = [next_key(entry) for entry in self.measured]
+        lost = first_not_finite(real, [*self.measured, *following])
         if lost is not None:
             entry, row, step = lost
             expected = f"a robot that measures finite values of {entry!r}"
@@ -178,48 +182,12 @@ def _digest(*tensors: Tensor) -> str:
     return blake2b(repr(content).encode(), digest_size=8).hexdigest()
 
 
-def _not_finite(
-    trajectories: TensorDictBase, entries: Sequence[NestedKey]
-) -> tuple[NestedKey, int, int] | None:
-    """Return the first entry, trajectory and step that counts and is not finite, if any is."""
-    mask: Tensor = trajectories.get("mask")
-    for entry in entries:
-        finite = trajectories.get(entry).isfinite().reshape(*mask.shape, -1).all(-1)
-        lost = (mask & ~finite).nonzero()
-        if len(lost):
-            row, step = lost[0].tolist()
-            return entry, row, step
-    return None
-
-
-def comparable(real: TensorDictBase, *, horizon: int) -> TensorDictBase:
-    """Cut real episodes where simulated ones are cut; refuse those that were cut before.
-
-    Args:
-        real: Trajectories ``[n, T]`` with a ``"mask"``.
-        horizon: Steps after which simulated trajectories are cut.
-
-    Raises:
-        ValueError: An episode neither ends nor lasts that long.
-    """
-    real = real[:, :horizon]
-    mask: Tensor = real.get("mask")
-    ended = (real.get(("next", "done")).reshape(mask.shape) & mask).any(-1)
-    length = mask.sum(-1)
-    short = ~ended & (length < horizon)
-    if short.any():
-        raise ValueError(
-            message(
-                f"real episodes that end, or last the {horizon} steps of simulated ones",
-                f"one cut after {int(length[short].min())}",
-                hint="the same horizon for the robot and the simulation",
-            )
-        )
-    return real
-
-
 class RecordedLogs:
     """Logs of a real robot.
+
+    They are handed on under their own names, which must be the simulator's where statistics read
+    them: the loop refuses others when it is made. A TensorDict renames its entries already:
+    ``trajectories.rename_key_("cmd", "action")``.
 
     Args:
         trajectories: Batch size ``[n, T]`` with a ``"mask"``: see :func:`.trajectories.pad`.
@@ -228,7 +196,8 @@ class RecordedLogs:
         action_key: Entry of the action.
 
     Raises:
-        TypeError: For what is not a TensorDict, or ``measured`` that is one name and no sequence.
+        TypeError: For what is not a TensorDict, a mask that is not of booleans, or ``measured``
+            that is one name and no sequence.
         ValueError: For no trajectory, missing entries, or measurements that are not finite.
     """
 
@@ -241,36 +210,9 @@ class RecordedLogs:
         measured: Sequence[NestedKey] = ("observation",),
         action_key: NestedKey = "action",
     ) -> None:
-        if not isinstance(trajectories, TensorDictBase):
-            got = type(trajectories).__name__
-            raise TypeError(message("trajectories [n, T] in a TensorDict", got, hint="pad(logs)"))
         _check_sequence(measured)
         values = [*measured, action_key, *(next_key(entry) for entry in measured)]
-        for name in (*values, "mask"):
-            value = trajectories.get(name, None)
-            if value is None:
-                found = sorted(map(str, trajectories.keys(include_nested=True)))
-                hint = "first_trajectories(batch) or pad(logs) add it" if name == "mask" else ""
-                raise ValueError(
-                    message("logs with an entry", str(name), available=found, hint=hint)
-                )
-        whole = trajectories.ndim == 2 and len(trajectories) > 0
-        if not whole or not trajectories.get("mask").any(-1).all():
-            raise ValueError(
-                message(
-                    "trajectories [n, T] of at least one step each", tuple(trajectories.batch_size)
-                )
-            )
-        lost = _not_finite(trajectories, values)
-        if lost is not None:
-            name, row, step = lost
-            raise ValueError(
-                message(
-                    f"finite values of {name!r}",
-                    f"NaN or infinity in trajectory {row} at step {step}",
-                    hint="cut the log there, or repair it",
-                )
-            )
+        check_real(trajectories, values)
         self.trajectories, self._entries = trajectories, (*values, "mask")
 
     @property

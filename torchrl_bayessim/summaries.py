@@ -273,6 +273,7 @@ class SummaryStatistics(TensorDictModuleBase):
             torch.Size([2, 8])
         """
         trajectories = self._masked(trajectories)
+        self._check_vectors(trajectories)
         mask = trajectories.get("mask")
         # steps that do not count go to the end, as in any padded trajectory
         order = (~mask.flatten(-2)).long().argsort(dim=-1, stable=True)
@@ -308,12 +309,8 @@ class SummaryStatistics(TensorDictModuleBase):
         self, tensordict: TensorDictBase, *, ordered: bool | None = None
     ) -> dict[int, Tensor]:
         """Return the values of all functions, or of those that are ``ordered`` or not."""
-        _check_entries(tensordict, self.in_keys[:3])
+        self._check_vectors(tensordict)
         state, mask = _float(tensordict.get(self.observation_key)), tensordict.get("mask")
-        if state.ndim != mask.ndim + 1:
-            expected = f"vectors in {self.observation_key!r}, shape (*, T, D)"
-            hint = "FlattenObservation(-2, -1) for matrices, CatTensors for several entries"
-            raise ValueError(message(expected, tuple(state.shape), hint=hint))
         following = _float(tensordict.get(next_key(self.observation_key)))
         if any(not -state.shape[-1] <= column < state.shape[-1] for column in self.angles):
             columns = f"angles among the {state.shape[-1]} columns of {self.observation_key!r}"
@@ -339,19 +336,34 @@ class SummaryStatistics(TensorDictModuleBase):
             raise TypeError(message("booleans in 'mask'", str(mask.dtype), hint="mask > 0"))
         return trajectories
 
-    def _encoded(self, action: Tensor, mask: Tensor) -> Tensor:
-        """Return actions as floats, shape ``(*, T, A)``."""
-        if action.is_floating_point() and action.ndim > mask.ndim:
-            return action
-        indices = action.ndim == mask.ndim or action.shape[-1] == 1
-        if indices and (self.one_hot or action.ndim == mask.ndim):
+    def _check_vectors(self, trajectories: TensorDictBase) -> None:
+        """Refuse states and actions that are not of shape ``(*, T, size)``."""
+        _check_entries(trajectories, self.in_keys[:3])
+        dimensions = trajectories.get("mask").ndim + 1
+        shape = trajectories.get(self.observation_key).shape
+        if len(shape) != dimensions:
+            expected = f"vectors in {self.observation_key!r}, shape (*, T, D)"
+            hint = "FlattenObservation(-2, -1) for matrices, CatTensors for several entries"
+            raise ValueError(message(expected, tuple(shape), hint=hint))
+        action = trajectories.get(self.action_key)
+        index = self.one_hot and action.shape[-1] == 1 and not action.is_floating_point()
+        if index or action.ndim != dimensions:
+            kind = "" if action.is_floating_point() else "indices of "
             raise ValueError(
                 message(
                     "one-hot actions or torques, of shape (*, T, A)",
-                    f"indices of shape {tuple(action.shape)}",
-                    hint="an environment with categorical_action_encoding=False",
+                    f"{kind}shape {tuple(action.shape)}",
+                    hint="an environment with categorical_action_encoding=False; in logs, "
+                    "torch.nn.functional.one_hot"
+                    if kind
+                    else "unsqueeze(-1) for one torque",
                 )
             )
+
+    def _encoded(self, action: Tensor, mask: Tensor) -> Tensor:
+        """Return actions as floats, shape ``(*, T, A)``."""
+        if action.is_floating_point():
+            return action
         if not self.one_hot:
             return action.float()
         encoded = encode_actions(action)

@@ -28,8 +28,9 @@ from .counts import check_count
 from .errors import PhysicsError, message
 from .inference.fit import FitReport
 from .inference.refinement import PosteriorRefinement
+from .real_trajectories import check_columns, check_cut, check_real, comparable
 from .remote_source import PolicyWithSource, push_source
-from .robots import RealSystem, comparable
+from .robots import RealSystem
 from .sources import Defensive, Source, check_prior_share
 from .summaries import SummaryStatistics
 from .transforms.domain_randomizer import DomainRandomizer
@@ -59,7 +60,8 @@ class PosteriorTrainerHook(TrainerHookBase):
         TypeError: A count is no whole number.
         ValueError: An interval below 2, or no episodes; at registration, a trainer whose batches do
             not begin with a reset or may be made by several policies, or a randomizer that its
-            collector does not step.
+            collector does not step; in training, a robot that answers with other entries or sizes
+            than the simulator has, or whose episodes are cut elsewhere.
         PhysicsError: The batch of the pairs was not drawn from where the posterior is learned.
         RuntimeError: The policy was changed while the batch of the pairs was collected.
 
@@ -204,8 +206,12 @@ class PosteriorTrainerHook(TrainerHookBase):
             )
         key = (self.seed, "batch", self._batches)
         real = self.robot.rollouts(policy, episodes=self.episodes, key=key)
+        read = self.statistics.in_keys
+        check_real(real, read)
         real = comparable(real, horizon=batch.shape[-1])
         pairs = self.statistics(batch)
+        check_columns(real, {key: batch.get(key).shape[-1] for key in read[:3]})
+        check_cut(batch, real)
         self._check_drawn(pairs.get("theta", None))
         observed = self.statistics(real).get("summary")
         self.report = self.refinement.learn(
