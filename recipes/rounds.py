@@ -23,11 +23,20 @@ from torchrl_bayessim.whole_file import write_text
 class Journal:
     """What each round gave, kept beside the checkpoint so that a resumed run reports them all.
 
-    A logger, if there is one, is told everything again: it begins anew in every process.
+    A logger, if there is one, is told everything again: it begins anew in every process. Over the
+    frames of training it gets ``train/*``, and each round ``posterior/NAME``, ``posterior/NAME_sd``
+    of the parameters' ``names``, and ``real/return``.
     """
 
-    def __init__(self, path: Path, *, resume: bool, logger: Logger | None = None) -> None:
-        self.path, self.logger = path, logger
+    def __init__(
+        self,
+        path: Path,
+        *,
+        resume: bool,
+        logger: Logger | None = None,
+        names: tuple[str, ...] = (),
+    ) -> None:
+        self.path, self.logger, self.names = path, logger, names
         resume = resume and path.exists()  # not before the end of the first round
         self.rounds: list[dict[str, Any]] = json.loads(path.read_text()) if resume else []
         for entry in self.rounds:
@@ -41,10 +50,18 @@ class Journal:
         write_text(self.path, json.dumps(recipe.plain(self.rounds)))
 
     def _log(self, entry: dict[str, Any]) -> None:
-        for point in entry["curve"] if self.logger else ():
+        if self.logger is None:
+            return
+        for point in entry["curve"]:
             for name, value in point.items():
                 number = math.nan if value is None else value
                 self.logger.log_scalar(f"train/{name}", number, step=int(point["frames"]))
+        moments = zip(self.names, entry["posterior_mean"], entry["posterior_sd"], strict=True)
+        scalars = {"real/return": entry["real_return"]}
+        for name, mean, sd in moments:
+            scalars |= {f"posterior/{name}": mean, f"posterior/{name}_sd": sd}
+        for name, value in scalars.items():
+            self.logger.log_scalar(name, value, step=entry["frames"])
 
 
 def describe(

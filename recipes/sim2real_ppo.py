@@ -78,7 +78,8 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
 
     loop, learner, there = make_loop(task, truth, settings, out)
     resumed = loop.resume() if settings.resume else False
-    done = Journal(out / "rounds.json", resume=resumed, logger=logger)
+    names = task.prior.names
+    done = Journal(out / "rounds.json", resume=resumed, logger=logger, names=names)
     print(f"{settings.task}: {task.prior}")
     for name in idle(task):
         print(f"note: {name} changes nothing that is observed, so no data can tell it")

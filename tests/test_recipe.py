@@ -90,6 +90,9 @@ def test_pictures_curves_and_checkpoint_are_there(finished):
     assert load(folder / "checkpoint.pt")["loop"]["round"] == 2
     scalars = list(folder.rglob("*.csv"))
     assert any("loss_objective" in path.name for path in scalars)
+    rounds = [path.read_text().split() for path in scalars if path.parent.name == "posterior"]
+    assert len(rounds) == 4  # mean and deviation of both parameters
+    assert all(len(lines) == 2 for lines in rounds)
     assert all(path.read_text().strip() for path in scalars)
 
 

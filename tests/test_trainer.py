@@ -173,6 +173,16 @@ def test_the_moments_of_the_posterior_are_logged_once_per_refinement():
     for name in ("loss", "dropped", "length", "length_sd"):
         assert len(trainer._log_dict[f"posterior/{name}"]) == 3
     assert 0.2 < trainer._log_dict["posterior/length"][-1] < 1.5
+    assert trainer._log_dict["real/return"] == [STEPS] * 3  # nobody falls in eight steps
+
+
+def test_a_robot_need_not_know_rewards():
+    trainer, _, randomizer = direct(batches=2)
+    robot = Answering(lambda real: real.exclude(("next", "reward")))
+    make_hook(randomizer, robot).register(trainer)
+    trainer.train()
+    assert "real/return" not in trainer._log_dict
+    assert len(trainer._log_dict["posterior/length"]) == 1
 
 
 def test_a_loaded_hook_goes_on_where_it_stopped(tmp_path):

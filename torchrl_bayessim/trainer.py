@@ -33,6 +33,7 @@ from .remote_source import PolicyWithSource, push_source
 from .robots import RealSystem
 from .sources import Defensive, Source, check_prior_share
 from .summaries import SummaryStatistics
+from .trajectories import returns
 from .transforms.domain_randomizer import DomainRandomizer
 
 
@@ -126,6 +127,7 @@ class PosteriorTrainerHook(TrainerHookBase):
         self.prior_share, self.seed = prior_share, seed
         self.report: FitReport | None = None
         self._batches = 0  # processed so far
+        self._earned: dict[str, float] = {}
         self._collector: BaseCollector | None = None
         self._noted: dict[str, Tensor] = {}
         self._source: Source | None = None
@@ -182,12 +184,13 @@ class PosteriorTrainerHook(TrainerHookBase):
             self._draw_next()
 
     def log(self, batch: TensorDictBase) -> dict[str, float] | None:
-        """Return the posterior's moments and its fit, after a refinement."""
+        """Return the posterior's moments, its fit and the robot's mean return, if it knows one."""
         del batch
         posterior, report = self.refinement.posterior, self.report
         if posterior is None or report is None or self._batches % self.interval != 1:
             return None
         scalars = {"posterior/loss": report.best, "posterior/dropped": float(report.dropped)}
+        scalars |= self._earned
         moments = zip(posterior.names, posterior.mean, posterior.stddev, strict=True)
         for name, mean, spread in moments:
             scalars |= {f"posterior/{name}": mean.item(), f"posterior/{name}_sd": spread.item()}
@@ -212,6 +215,8 @@ class PosteriorTrainerHook(TrainerHookBase):
         pairs = self.statistics(batch)
         check_columns(real, {key: batch.get(key).shape[-1] for key in read[:3]})
         check_cut(batch, real)
+        known = real.get(("next", "reward"), None) is not None
+        self._earned = {"real/return": returns(real).mean().item()} if known else {}
         self._check_drawn(pairs.get("theta", None))
         observed = self.statistics(real).get("summary")
         self.report = self.refinement.learn(
