@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 
+from torchrl_bayessim.agents.hindsight import HindsightReplayBuffer
 from torchrl_bayessim.counts import check_count
 from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
 from torchrl_bayessim.evaluation import evaluate
@@ -77,6 +78,8 @@ COUNTS = {
     "epochs": lambda: fitted(epochs=2.0),
     "batch_size": lambda: fitted(batch_size=None),
     "steps of a lag": lambda: autocorrelation(1.5),
+    "draws in a pool": lambda: DomainRandomizer(PRIOR, pool=2.5),
+    "transitions of capacity": lambda: HindsightReplayBuffer(None, capacity=1e6),
     "waypoints": lambda: waypoints(2.5),
     "knots": lambda: excited(knots=3.0),
     "candidates": lambda: excited(candidates=3.0),

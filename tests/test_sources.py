@@ -111,7 +111,7 @@ def test_episode_draws_remember_a_bounded_number_of_tables():
 
 
 def test_pool_needs_a_source_that_samples():
-    with pytest.raises(ValueError, match="pool > 0 of a source that samples"):
+    with pytest.raises(ValueError, match="draws in a pool to be positive, got 0"):
         EpisodeDraws(Normal(0.0), pool=0)
-    with pytest.raises(ValueError, match="pool > 0 of a source that samples"):
+    with pytest.raises(ValueError, match="a source that samples, to draw a pool from, got 'a G"):
         EpisodeDraws(Grid([[0.0]]), pool=3)

@@ -16,6 +16,7 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor
 
+from .counts import check_count
 from .errors import message
 from .sources import Empirical, Grid, Source, check_source, draw
 
@@ -34,7 +35,7 @@ class EpisodeDraws:
         entry: What is drawn: two entries of one environment are independent.
 
     Raises:
-        TypeError: ``source`` cannot be sampled.
+        TypeError: ``source`` cannot be sampled, or ``pool`` is no whole number.
         ValueError: ``pool`` is not positive, or is given for a `Grid`.
 
     Example:
@@ -54,8 +55,10 @@ class EpisodeDraws:
     ) -> None:
         if not isinstance(source, Grid):
             check_source(source)
-        if pool is not None and (pool < 1 or isinstance(source, Grid)):
-            raise ValueError(message("pool > 0 of a source that samples", pool))
+        if pool is not None:
+            check_count("draws in a pool", pool)
+            if isinstance(source, Grid):
+                raise ValueError(message("a source that samples, to draw a pool from", "a Grid"))
         self._key = (seed, entry if isinstance(entry, str) else repr(entry))
         if pool is not None and not isinstance(source, Grid):
             source = Empirical(draw(source, pool, key=(*self._key, "pool")))

@@ -150,7 +150,7 @@ def test_unfinished_episodes_are_refused():
     ("options", "match"),
     [
         ({"share": 1.1}, r"relabelled transitions in \[0, 1\], got 1.1"),
-        ({"capacity": 0}, "at least 1 transition, got 0"),
+        ({"capacity": 0}, "transitions of capacity to be positive, got 0"),
         ({"moving": -1.0}, "not negative, or None, got -1.0"),
     ],
 )

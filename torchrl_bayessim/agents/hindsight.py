@@ -20,6 +20,7 @@ from torchrl.data import LazyTensorStorage
 from torchrl.data.replay_buffers import Sampler, Storage
 from torchrl.data.replay_buffers.her import HERReplayBuffer
 
+from ..counts import check_count
 from ..errors import message
 
 GoalReward = Callable[[Tensor, Tensor], Tensor]
@@ -50,6 +51,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
             goal's unit; None to relabel any.
 
     Raises:
+        TypeError: ``capacity`` is no whole number.
         ValueError: ``share`` is no probability, ``capacity`` not positive, or ``moving`` negative.
 
     Example:
@@ -71,8 +73,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
     ) -> None:
         if not 0 <= share <= 1:
             raise ValueError(message("a share of relabelled transitions in [0, 1]", share))
-        if capacity < 1:
-            raise ValueError(message("a capacity of at least 1 transition", capacity))
+        check_count("transitions of capacity", capacity)
         if moving is not None and moving < 0:
             raise ValueError(message("a distance that is not negative, or None", moving))
         self.capacity, self.moving = capacity, moving

@@ -48,7 +48,7 @@ class DomainRandomizer(Transform):
         PhysicsError: No `ApplyPhysics` before it writes ``key``, or for other parameters; another
             randomizer of ``key``; at a reset, workers of a batched environment that nothing tells
             apart.
-        TypeError: The source, now or when assigned, cannot be sampled.
+        TypeError: The source, now or when assigned, cannot be sampled; ``pool`` is no whole number.
         ValueError: ``pool`` is not positive, or is given with a `Grid`; the source is over other
             parameters.
 
