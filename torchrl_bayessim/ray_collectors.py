@@ -14,7 +14,7 @@ __all__ = ["RayCollectors"]
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, Self
@@ -86,25 +86,33 @@ class RayCollectors:
         if workers < 1 or environments % workers:
             expected = f"a number of workers that divides the {environments} environments"
             raise ValueError(message(expected, workers))
-        from torchrl.collectors.distributed import RayCollector
-
         self.environments, self.steps, self.workers = environments, steps, workers
         needs = _WORKER | (worker or {})
         self._block: tuple[Any, DomainRandomizer] | None = None
         self._own = not self._ray.is_initialized()
         if self._own:
             self._ray.init(**(_CLUSTER | (cluster or {})))
-        self._check_processors(needs["num_cpus"])
+        with ExitStack() as undo:
+            undo.callback(self._end_cluster)
+            self._check_processors(needs["num_cpus"])
+            self._collector = self._begun(make, policy, needs)
+            undo.pop_all()
+
+    def _begun(self, make: Callable[[int], EnvBase], policy: Any, needs: dict[str, Any]) -> Any:
+        """Return TorchRL's collector of the workers."""
+        from torchrl.collectors.distributed import RayCollector
+
+        options = {
+            "whole": partial(make, self.environments),
+            "auto_register_policy_transforms": False,
+        }
         with self._errors():
-            self._collector = RayCollector(
-                [partial(make, environments // workers)] * workers,
+            return RayCollector(
+                [partial(make, self.environments // self.workers)] * self.workers,
                 UndisturbedPolicy(policy),
                 collector_class=RayWorker,  # pyright: ignore[reportArgumentType]
-                collector_kwargs=[
-                    {"whole": partial(make, environments), "auto_register_policy_transforms": False}
-                    for _ in range(workers)
-                ],
-                frames_per_batch=environments * steps,
+                collector_kwargs=[dict(options) for _ in range(self.workers)],
+                frames_per_batch=self.environments * self.steps,
                 sync=True,
                 remote_configs=needs,
                 weight_sync_schemes={},  # a worker begun anew needs them with the question
@@ -232,7 +240,6 @@ class RayCollectors:
         """Refuse a cluster on which workers would wait for ever."""
         there = self._ray.cluster_resources().get("CPU", 0)
         if each * self.workers > there:
-            self._end_cluster()
             expected = f"a cluster with {each * self.workers:g} processors for the workers"
             hint = "fewer workers, or RAY_ADDRESS of a larger cluster"
             raise ValueError(message(expected, f"{there:g}", hint=hint))

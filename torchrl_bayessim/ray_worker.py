@@ -57,7 +57,8 @@ class RayWorker(Collector):
         torch.set_num_threads(1)
         self.number: int = options["worker_idx"]
         super().__init__(create_env_fn, **options)  # pyright: ignore[reportArgumentType]
-        self._make_whole, self._whole = whole, None
+        self._make_whole: Callable[[], EnvBase] = whole
+        self._whole: EnvBase | None = None
         self._at: tuple[Any, int] | None = None  # block, and batches of it so far
 
     def __bool__(self) -> bool:  # Ray asks before it sends an error; there is no length to tell
@@ -72,7 +73,8 @@ class RayWorker(Collector):
         """Return the summaries at ``theta``, the first batch of which has this number."""
         if question is None:
             return torch.empty(0), []
-        self._whole = self._whole or self._make_whole()
+        if self._whole is None:
+            self._whole = self._make_whole()
         collector = make_collector(self._whole, question.policy, steps=question.steps)
         try:
             return collect_summaries(

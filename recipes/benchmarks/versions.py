@@ -36,7 +36,7 @@ SMOKE = (
 OF_EXTRA = {
     "recipes": ("recipes", "matplotlib omegaconf pyarrow", "tests/test_plots.py tests/logs"),
     "sbi": ("sbi", "sbi", "tests/test_sbi_source.py"),
-    "ray": ("ray", "ray", "tests/test_remote_source.py tests/test_ray_collectors.py"),
+    "ray": ("recipes,ray", "ray", "tests/test_remote_source.py tests/test_ray_collectors.py"),
     "pybullet": ("pybullet", "pybullet pybullet_envs_gymnasium", "tests/physics"),
     "minari": ("minari", "minari h5py", "tests/logs/test_read.py"),
     "tensorboard": ("recipes,tensorboard", "tensorboard", "tests/test_journal.py"),
