@@ -6,6 +6,9 @@ import pytest
 from torchrl_bayessim.diagnosis.model import Model, unevenness
 from torchrl_bayessim.diagnosis.objective import Point
 from torchrl_bayessim.diagnosis.refit import Fit
+from torchrl_bayessim.diagnosis.selection import Selection
+from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
+from torchrl_bayessim.diagnosis.verdict import _visible
 from torchrl_bayessim.diagnosis.whitening import innovation_noise
 
 SEGMENTS, ROWS, CHANNELS = 60, 8, 2
@@ -67,3 +70,35 @@ def test_what_comes_and_goes_is_uneven():
     innovations = white(0)
     innovations[::4] *= 2.0
     assert unevenness(judged(innovations)) > 5.0
+
+
+def selection(innovations, p_value):
+    model = judged(innovations)
+    return Selection(model, model, (), (p_value,), (), {})
+
+
+def measured(refit, low):
+    return Shrinkage(refit, refit, refit, 0.0, (0.0, 0.0), (low, low + 0.4), (low, low + 0.4))
+
+
+def uneven(factor):
+    innovations = white(0)
+    innovations[::4] *= factor
+    return innovations
+
+
+@pytest.mark.parametrize(
+    ("innovations", "p_value", "test", "seen"),
+    [
+        (white(0), 0.5, measured(0.97, -0.1), False),  # noise
+        (1.1 * white(0), 0.005, measured(1.2, 0.1), False),  # a floor that is a little low
+        (1.5 * white(0), 0.005, measured(2.2, 0.8), True),  # every split shows a gap
+        (1.5 * white(0), 0.005, measured(1.0, -0.2), False),  # test runs do not
+        (uneven(2.0), 0.005, measured(1.2, 0.1), True),  # it comes and goes
+        (uneven(2.0), 0.5, measured(1.2, 0.1), False),  # as outliers of a sensor do
+        (uneven(2.0), 1e-9, measured(0.9, -0.2), True),  # where training runs alone moved
+        (white(0), 1e-9, measured(0.9, -0.2), False),
+    ],
+)
+def test_a_gap_that_nothing_explains_is_one_beyond_noise(innovations, p_value, test, seen):
+    assert _visible(selection(innovations, p_value), test, alpha=0.01) == seen
