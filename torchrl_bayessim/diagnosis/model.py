@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["LIKELY", "Model", "as_good", "criterion", "gain", "judged", "needed", "unevenness"]
+__all__ = ["LIKELY", "Model", "as_good", "criterion", "gain", "judged", "needed"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -105,15 +105,3 @@ def _positive(differences: Array, logs: NDArray[np.int64]) -> float:
     score = mean / max(np.sqrt(max(alone, together)) / count, 1e-12)
     groups = len(np.unique(logs)) if together > alone else count
     return float(student.sf(score, max(groups - 1, 1)))
-
-
-def unevenness(model: Model) -> float:
-    """Return by how many standard errors what is left varies more between segments than noise.
-
-    The misfits of ``S`` segments of ``n`` numbers of white noise have the variance ``2 n``, of any
-    scale, and an excess kurtosis of ``12 / n``. An effect that comes and goes does not.
-    """
-    misfits, n = model.deviances(), model.fit.innovations.shape[1]
-    ratio = misfits.var(ddof=1) / (2 * n) / max((misfits.mean() / n) ** 2, 1e-12)
-    size = len(misfits)
-    return float((ratio - 1) / np.sqrt(2 / (size - 1) + 12 / (n * size)))

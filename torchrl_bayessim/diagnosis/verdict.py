@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from ..logs.system import System
-from .model import unevenness
 from .preparation import Prepared
 from .report import Candidate, Finding, Verdict
 from .selection import Selection
@@ -31,8 +30,6 @@ from .shrinkage import Shrinkage
 
 _NEGLIGIBLE = 0.05  # of the noise floor: an excess that no one would chase
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
-_UNEVEN = 5.0  # standard errors; or that what is left varies more between segments than noise
-_BEYOND_DOUBT = 1e-6  # a p-value that needs no other split
 _SHOWN = 1.2  # mean squared innovation of runs that show a gap
 _NOISE_AGAIN = 2.0  # mean squared innovation: as much again as the noise
 _ALL, _NAMED, _PARTIAL = 0.98, 0.8, 0.4
@@ -57,7 +54,9 @@ def conclude(
     groups |= {u.effect.group for s in selection.screens[:1] for u in s.units if u.name in confused}
     groups |= scattered
     significant = selection.p_values[0] <= alpha
-    visible = _visible(selection, measured, alpha=alpha)
+    splits = [float((m**2).mean()) for m in
+              (selection.nominal.fit.innovations, selection.nominal.validation)]  # fmt: skip
+    visible = measured.excess_ci[0] > 0 and min(measured.refit, *splits) > _UNEXPLAINED
     # of a large gap, 2 % may be ten times the noise: proof that the law is another one
     nearly_all = measured.explained >= _ALL and measured.effects <= _NOISE_AGAIN
     left = measured.remainder_ci[0] > _NEGLIGIBLE and not nearly_all
@@ -101,21 +100,6 @@ def conclude(
         ),
         alarms,
     )
-
-
-def _visible(selection: Selection, measured: Shrinkage, *, alpha: float) -> bool:
-    """Return whether there is a gap although no effect explains it.
-
-    Test runs show an excess, and so do all splits, or some segments far more than others. Or the
-    training runs alone leave no doubt: others may not have moved where it acts.
-    """
-    p_value, uneven = selection.p_values[0], unevenness(selection.best) > _UNEVEN
-    if p_value <= _BEYOND_DOUBT and uneven:
-        return True
-    before = (selection.nominal.fit.innovations, selection.nominal.validation)
-    least = min([measured.refit, *(float((split**2).mean()) for split in before)])
-    shown = least > _UNEXPLAINED or (p_value <= alpha and uneven)
-    return measured.excess_ci[0] > 0 and shown
 
 
 def _hardly_shown(measured: Shrinkage) -> bool:

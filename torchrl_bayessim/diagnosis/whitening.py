@@ -34,6 +34,7 @@ _KNOWN = 3.0  # times the error of an estimate that knows what it is to predict
 _ROUNDING = 1e-13  # of the largest variance
 _MOST, _HALF, _CALM = 0.9, 0.5, 0.25  # shares of the segments that noise is estimated from
 _UNEVEN = 1.3  # ratio of the first two estimates, beyond which some segments hold more than noise
+_ENOUGH = 40  # segments, to single out a quarter of them
 _DRAWS = 8  # simulated robots that the whitening is checked on
 _THIRD_DIFFERENCE = 20.0  # 1 + 9 + 9 + 1: variance of y₃ - 3y₂ + 3y₁ - y₀ per unit of white noise
 
@@ -183,8 +184,8 @@ def innovation_noise(innovations: Array, pushes: Array, checks: int) -> Array:
     gives in the same way: a model's error is smooth, and so drops out. What a constant force at any
     joint could explain within the segment is projected out first, since over a few steps a missing
     force is hardly more than that. The worst tenth of the segments is left out, or, where the worse
-    half has more than its part, all but the calmest quarter: noise is the same everywhere, and what
-    a missing effect does, such as an impact where backlash closes, is not.
+    half of many has more than its part, all but the calmest quarter: noise is the same everywhere,
+    and what a missing effect does, such as an impact where backlash closes, is not.
 
     Args:
         innovations: Shape ``(S, KC)``.
@@ -207,4 +208,5 @@ def innovation_noise(innovations: Array, pushes: Array, checks: int) -> Array:
         spread(innovations, share) / np.mean([spread(one, share) for one in noise], axis=0)
         for share in (_MOST, _HALF, _CALM)
     )
-    return np.sqrt(np.where(most > _UNEVEN * half, calm, most))
+    uneven = (most > _UNEVEN * half) & (len(innovations) >= _ENOUGH)
+    return np.sqrt(np.where(uneven, calm, most))
