@@ -131,7 +131,10 @@ def test_a_folder_is_there_when_it_is_whole_and_replaces_none(tmp_path):
         assert not folder.exists()
     assert list(folder.parent.iterdir()) == [folder]
     assert (folder / "file").read_text() == "whole"
-    refused = pytest.raises(FileExistsError, match="a folder that does not exist yet")
-    with refused, replacing_folder(folder):
-        pass
+    link = folder.with_name("link")
+    link.symlink_to("nowhere")
+    for taken in (folder, link):
+        refused = pytest.raises(FileExistsError, match="a folder that does not exist yet")
+        with refused, replacing_folder(taken):
+            pass
     assert (folder / "file").read_text() == "whole"

@@ -93,7 +93,7 @@ def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         ['half']
     """
     path = Path(path).absolute()
-    if path.exists():
+    if os.path.lexists(path):  # a link to nothing too
         hint = "another folder; what is there is not written over"
         raise FileExistsError(message("a folder that does not exist yet", str(path), hint=hint))
     path.parent.mkdir(parents=True, exist_ok=True)

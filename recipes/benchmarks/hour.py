@@ -2,7 +2,7 @@
 
 CartPole (180,000 steps of 0.02 s) with random actions, new physics in every episode, through the
 collector that everything else uses. Prints one JSON line: growth of the process's own memory from
-the first tenth to the end, in MiB, and the frames per second::
+the second tenth to the last, in MiB, and the frames per second::
 
     python recipes/benchmarks/hour.py [environments=1024] [minutes=60] [mujoco=0]
 

@@ -123,6 +123,20 @@ def entities():
     yield xml("external document type", outer, "a document type")
 
 
+def namespaces():
+    """Name elements so that only MuJoCo, which ignores namespaces, takes them for its own."""
+    own = '<mujoco><include file="../secret.xml"/></mujoco>'
+    named = inside('<include xmlns="x" file="part.xml"/>')
+    yield xml("include in a namespace", named, "a namespace", part_xml=own)
+    plain = inside('<include file="part.xml"/>')
+    root = '<mujoco xmlns="x"><include file="other.xml"/></mujoco>'
+    yield xml("part in a namespace", plain, "a namespace", part_xml=root, other_xml=own)
+    prefixed = inside('<include xmlns:y="x" file="part.xml"/>')
+    yield xml("prefix of a namespace", prefixed, "a namespace", part_xml=own)
+    many = '<replicate xmlns="x" count="3000"><replicate count="50"><geom size=".1"/></replicate></replicate>'  # noqa: E501
+    yield xml("bomb in a namespace", inside(many, "<body"), "a namespace")
+
+
 def broken():
     """Write XML that is none, or none of MuJoCo's."""
     contents = {
@@ -212,4 +226,4 @@ def bombs():
     yield Case(name="XML of a huge picture", spoil=picture, said="at most")
 
 
-CASES = [*cut_off(), *leaving(), *links(), *entities(), *broken(), *bombs()]
+CASES = [*cut_off(), *leaving(), *links(), *entities(), *namespaces(), *broken(), *bombs()]

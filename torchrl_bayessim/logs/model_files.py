@@ -88,6 +88,9 @@ class _Builder(ElementTree.TreeBuilder):
     def doctype(self, *_: object) -> None:  # entities, which MuJoCo does not have
         raise ValueError("a document type")
 
+    def start_ns(self, *_: object) -> None:  # MuJoCo reads on as if the names were its own
+        raise ValueError("a namespace")
+
 
 def _dirs(roots: dict[Path, Element]) -> set[Path]:
     """Return where a model's files may be looked for."""
