@@ -347,6 +347,12 @@ def test_paper_mode_learns_and_keeps_to_the_support(features):
     assert prior.contains(q.sample((100,))).all()
 
 
+@pytest.mark.parametrize("given", ["a", None, [[1.0, 2.0], [1.0]]])
+def test_summaries_are_numbers(given):
+    with pytest.raises(TypeError, match=r"real trajectories, numbers of shape \(n, 2\), got"):
+        posterior(ONE["linear"], dim=2).condition(given)
+
+
 def test_features_are_of_summaries_of_the_given_size():
     with pytest.raises(ValueError, match="features of summaries of size 3, got 'of size 2'"):
         MixtureDensityPosterior(ONE["linear"], 3, features=NeuralFeatures(2))

@@ -205,9 +205,15 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
             check: Whether to look for reasons to doubt the result.
 
         Raises:
+            TypeError: For what is not made of numbers, or ragged.
             ValueError: For no summaries, wrong shapes, NaN or infinite statistics.
         """
-        given, size = torch.as_tensor(summaries), len(self.network.shift)
+        size = len(self.network.shift)
+        try:
+            given = torch.as_tensor(summaries)
+        except (TypeError, ValueError, RuntimeError):  # torch's, of what it cannot make sense of
+            expected = f"summaries of n >= 1 real trajectories, numbers of shape (n, {size})"
+            raise TypeError(message(expected, summaries)) from None
         summaries = torch.atleast_2d(given.to(self.network.shift.device))
         if summaries.shape != (len(summaries), size) or len(summaries) == 0:
             raise ValueError(
