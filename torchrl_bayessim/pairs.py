@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-__all__ = ["empty_pairs", "fill_parameters", "fill_summaries"]
+__all__ = ["counted", "empty_pairs", "fill_parameters", "fill_summaries"]
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -14,6 +15,18 @@ from tqdm.auto import tqdm
 
 from .inference.rows import parts
 from .sources import Source, draw
+
+_T = TypeVar("_T")
+
+
+def counted(
+    turns: Iterable[tuple[Tensor, _T]], total: int, *, progress: bool
+) -> Iterator[tuple[Tensor, _T]]:
+    """Yield the turns of a simulation, with a progress bar of their summaries, ``(n, L)`` each."""
+    with tqdm(total=total, desc="simulate", disable=not progress, leave=False, unit="pair") as bar:
+        for summaries, rest in turns:
+            yield summaries, rest
+            bar.update(len(summaries))
 
 
 def empty_pairs(count: int, folder: Path | None) -> TensorDictBase:
@@ -44,14 +57,11 @@ def fill_summaries(
 ) -> None:
     """Give pairs their ``"summary"``, turn by turn: the first of each turn, ``(n, L)``."""
     done, room = 0, torch.empty(0)
-    options = {"total": len(pairs), "desc": "simulate", "leave": False, "unit": "pair"}
-    with tqdm(disable=not progress, **options) as bar:
-        for summaries, _ in turns:
-            if len(summaries):
-                room = room if done else _room(pairs, "summary", summaries)
-                room[done : done + len(summaries)] = summaries
-                done += len(summaries)
-                bar.update(len(summaries))
+    for summaries, _ in counted(turns, len(pairs), progress=progress):
+        if len(summaries):
+            room = room if done else _room(pairs, "summary", summaries)
+            room[done : done + len(summaries)] = summaries
+            done += len(summaries)
 
 
 def _room(pairs: TensorDictBase, name: str, rows: Tensor) -> Tensor:

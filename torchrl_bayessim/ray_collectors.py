@@ -24,10 +24,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
-from tqdm.auto import tqdm
 
 from .diverged import UndisturbedPolicy
 from .errors import SimulationError, message
+from .pairs import counted
 from .ray_worker import Block, Inference, RayWorker
 from .summaries import SummaryStatistics
 from .trajectories import concatenate, first_trajectories
@@ -183,13 +183,10 @@ class RayCollectors:
     ) -> tuple[Tensor, list[TensorDictBase]]:
         """Return all of :meth:`summaries_in_turn` together, ``(N, L)``, and all kept batches."""
         turns = self.summaries_in_turn(policy, statistics, theta, **asked)
-        options = {"total": len(theta), "desc": "simulate", "leave": False, "unit": "pair"}
         found, batches = [], []
-        with tqdm(disable=not progress, **options) as bar:
-            for summaries, kept in turns:
-                found.append(summaries)
-                batches += kept
-                bar.update(len(summaries))
+        for summaries, kept in counted(turns, len(theta), progress=progress):
+            found.append(summaries)
+            batches += kept
         return torch.cat(found), batches
 
     def check(self, env: EnvBase, *, steps: int | None = None) -> None:

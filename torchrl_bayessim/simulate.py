@@ -20,12 +20,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
-from tqdm.auto import tqdm
 
 from .counts import check_count
 from .diverged import UndisturbedPolicy
 from .errors import PhysicsError, SimulationError, message
-from .pairs import empty_pairs, fill_parameters, fill_summaries
+from .pairs import counted, empty_pairs, fill_parameters, fill_summaries
 from .randomness import isolated, seed_from
 from .sources import Grid
 from .summaries import SummaryStatistics
@@ -170,15 +169,11 @@ def collect_summaries(
     kept: list[TensorDictBase] = []
     options: dict[str, Any] = {"trajectories": trajectories, "key": key, "prepare": prepare}
     turns = summaries_in_turn(collector, statistics, randomizer, theta, first=first, **options)
-    with tqdm(
-        total=len(theta), desc="simulate", disable=not progress, leave=False, unit="pair"
-    ) as bar:
-        for summaries, batch in turns:
-            if len(kept) < keep:
-                kept.append(batch.clone())
-            if len(summaries):
-                found.append(summaries)
-            bar.update(len(summaries))
+    for summaries, batch in counted(turns, len(theta), progress=progress):
+        if len(kept) < keep:
+            kept.append(batch.clone())
+        if len(summaries):
+            found.append(summaries)
     return torch.cat(found), kept
 
 
