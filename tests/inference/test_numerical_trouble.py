@@ -113,6 +113,72 @@ def test_a_covariance_that_is_indefinite_by_more_than_rounding_is_refused():
         divide(mixture, torch.zeros(2), saddle, widest=torch.eye(2))
 
 
+def pair(width, *, apart=1.0):
+    """Return a component of width 1, and one of ``width`` as far away as said."""
+    loc = apart * torch.arange(2, dtype=torch.float64)[:, None].expand(2, 3)
+    scale = torch.tensor([1.0, width], dtype=torch.float64)[:, None, None] * torch.eye(3)
+    return Mixture(torch.zeros(2, dtype=torch.float64), loc, scale)
+
+
+UNIT = torch.eye(3, dtype=torch.float64)
+ALGEBRA = {
+    "multiply": lambda m: multiply(m, m),
+    "divide": lambda m: divide(m, torch.zeros(3).double(), 9 * UNIT, widest=20 * UNIT).mixture,
+    "reduce": lambda m: reduce(m, 1),
+}
+
+
+@pytest.mark.parametrize("name", ALGEBRA)
+@pytest.mark.parametrize("width", [0.0, 1e-200])
+def test_points_are_widened_where_the_mixture_has_a_scale(name, width):
+    with pytest.warns(UserWarning, match="1 of 2 components have collapsed to points: widened"):
+        found = ALGEBRA[name](pair(width))
+    assert all(part.isfinite().all() for part in found)
+    assert (found.covariance.diagonal(dim1=-2, dim2=-1) > 0).all()
+    if name == "reduce":  # both mean 0.5 away from theirs
+        torch.testing.assert_close(found.covariance[0], UNIT / 2 + 1 / 4)
+    far = pair(0.0, apart=3.0)._replace(scale_tril=torch.zeros(2, 3, 3, dtype=torch.float64))
+    with pytest.warns(UserWarning, match="2 of 2 components have collapsed"):
+        assert ALGEBRA[name](far).loc.isfinite().all()
+
+
+@pytest.mark.parametrize("name", ALGEBRA)
+def test_what_has_no_scale_or_no_number_is_refused_by_its_place(name):
+    alone = Mixture(*(part[1:] for part in pair(0.0)))
+    with pytest.raises(ValueError, match=r"a mixture of some width.*of 0 in component 0 of 1"):
+        ALGEBRA[name](alone)
+    for bad in (torch.nan, torch.inf, 1e200):
+        with pytest.raises(ValueError, match=r"components of finite.*infinity in component 1 of 2"):
+            ALGEBRA[name](pair(bad))
+    lost = pair(1.0)._replace(logits=torch.tensor([torch.nan, 0.0], dtype=torch.float64))
+    with pytest.raises(ValueError, match="NaN or infinity in component 0 of 2"):
+        ALGEBRA[name](lost)
+    if name != "reduce":  # of batches
+        two = zip(pair(1.0), pair(torch.nan), strict=True)
+        rows = Mixture(*(torch.stack(parts) for parts in two))
+        with pytest.raises(ValueError, match=r"in component 1 of 2, row \[1\]"):
+            ALGEBRA[name](rows)
+
+
+def test_divisors_without_width_or_numbers_are_refused():
+    whole, zero = pair(1.0), torch.zeros(3, dtype=torch.float64)
+    for bad, said in (0.0, "positive definite.*of 0"), (torch.nan, "finite"):
+        with pytest.raises(ValueError, match=f"covariances that are {said}"):
+            divide(whole, zero, bad * UNIT, widest=UNIT)
+        with pytest.raises(ValueError, match=f"covariances that are {said}"):
+            divide(whole, zero, UNIT, widest=bad * UNIT)
+    with pytest.raises(ValueError, match="a finite mean of the divisor"):
+        divide(whole, zero + torch.inf, UNIT, widest=UNIT)
+
+
+def test_components_as_thin_as_a_line_are_divided():
+    with pytest.warns(UserWarning, match="indefinite by rounding: widened"):
+        quotient = divide(flat(3), torch.zeros(3).double(), 9 * UNIT, widest=20 * UNIT).mixture
+    along = torch.ones(3, dtype=torch.float64)
+    found = (along @ quotient.covariance[0] @ along / 3).item()
+    assert found == pytest.approx(1 / (1 / 3 - 1 / 9), rel=1e-3)
+
+
 def refined(summary_of, observed, *, size=1, rounds=2, **options):
     """Return the posterior after some refinements."""
     prior = BoxPrior({f"p{i}": (0.0, 1.0) for i in range(size)})

@@ -106,7 +106,14 @@ def multiply(first: Mixture, second: Mixture) -> Mixture:
 
     Every pair gives one component, with weight
     :math:`\alpha_i \beta_j N(\mu_i; \mu_j, \Sigma_i + \Sigma_j)`.
+
+    Components that have collapsed to a point are widened, with a warning, to 1e-6 of the mixture's
+    own deviation.
+
+    Raises:
+        ValueError: A parameter is not finite, or a mixture is a single point.
     """
+    first, second = _spread_out(first), _spread_out(second)
     loc_1, loc_2 = torch.broadcast_tensors(first.loc.unsqueeze(-2), second.loc.unsqueeze(-3))
     cov_1, cov_2 = torch.broadcast_tensors(
         first.covariance.unsqueeze(-3), second.covariance.unsqueeze(-4)
@@ -144,6 +151,10 @@ def divide(mixture: Mixture, mean: Tensor, covariance: Tensor, *, widest: Tensor
         widest: The covariance :math:`B` that no component may exceed, shape ``(D, D)``: every
             :math:`B - \Sigma'_k` is positive semidefinite.
 
+    Raises:
+        ValueError: A parameter is not finite, the dividend is a single point, or a covariance is
+            indefinite by more than rounding.
+
     Example:
         >>> wide = Mixture(torch.zeros(1), torch.zeros(1, 1), 2 * torch.ones(1, 1, 1))
         >>> quotient = divide(wide, torch.ones(1), 8 * torch.ones(1, 1), widest=9 * torch.eye(1))
@@ -152,8 +163,15 @@ def divide(mixture: Mixture, mean: Tensor, covariance: Tensor, *, widest: Tensor
         >>> round(quotient.mixture.covariance.item(), 4)
         8.0
     """
+    mixture, scale_0 = _spread_out(mixture), _cholesky(covariance)
+    if not mean.isfinite().all():
+        raise ValueError(message("a finite mean of the divisor", mean.tolist()))
+    if not mixture.scale_tril.diagonal(dim1=-2, dim2=-1).all():  # thin as a line or a sheet
+        mixture = mixture._replace(scale_tril=_cholesky(mixture.covariance))
     precision = torch.cholesky_inverse(mixture.scale_tril)
-    precision_0 = torch.linalg.inv(covariance).unsqueeze(-3)
+    precision_0, singular = torch.linalg.inv_ex(covariance)
+    thin = singular.bool()[..., None, None]
+    precision_0 = torch.where(thin, torch.cholesky_inverse(scale_0), precision_0).unsqueeze(-3)
     shift = precision @ mixture.loc.unsqueeze(-1) - precision_0 @ mean[..., None, :, None]
     # in coordinates where the widest covariance is the identity
     unit = _cholesky(widest)
@@ -168,8 +186,8 @@ def divide(mixture: Mixture, mean: Tensor, covariance: Tensor, *, widest: Tensor
     scale = _cholesky(_symmetric(back @ (back / values.unsqueeze(-2)).mT))
     own = -mixture.scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     own = own - 0.5 * mixture.loc.shape[-1] * math.log(2 * math.pi)
-    scale_0 = _cholesky(covariance)[..., None, None, :, :]
-    divisor = component_log_prob(mixture.loc, mean[..., None, None, :], scale_0).squeeze(-1)
+    at = scale_0[..., None, None, :, :]
+    divisor = component_log_prob(mixture.loc, mean[..., None, None, :], at).squeeze(-1)
     raised = component_log_prob(mixture.loc, loc.unsqueeze(-2), scale.unsqueeze(-3)).squeeze(-1)
     repaired = bad.any(-1)
     widening = torch.where(repaired, (own - raised).clamp(max=0.0), own - raised)
@@ -184,7 +202,11 @@ def reduce(mixture: Mixture, components: int) -> Mixture:
     Leibler approach to Gaussian mixture reduction", IEEE T-AES 43, eq. 16):
     :math:`B_{ij} = \tfrac12[(\alpha_i + \alpha_j)\log|\Sigma_{ij}| - \alpha_i\log|\Sigma_i| -
     \alpha_j\log|\Sigma_j|]`. Components that together hold less than 1e-9 are dropped first.
+
+    Raises:
+        ValueError: A parameter is not finite, or the mixture is a single point.
     """
+    mixture = _spread_out(mixture)
     logits, order = mixture.logits.log_softmax(-1).sort(descending=True)
     keep = max(1, int((logits.exp().flip(0).cumsum(0).flip(0) > 1e-9).sum()))
     parts = (logits[:keep].exp(), mixture.loc[order[:keep]], mixture.covariance[order[:keep]])
@@ -217,6 +239,40 @@ def _merge_cost(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> Tensor
     return cost - weight * _log_det(cov) - second[0] * _log_det(second[2])
 
 
+def _spread_out(mixture: Mixture) -> Mixture:
+    """Return a mixture without points: components of no width get some, with a warning.
+
+    Raises:
+        ValueError: A parameter is not finite, or there is no scale to take a width from.
+    """
+    logits, loc, scale = mixture
+    covariance = mixture.covariance
+    wrong = ~covariance.isfinite().flatten(-2).all(-1) | ~loc.isfinite().all(-1)
+    wrong = wrong | logits.isnan() | logits.isposinf()
+    if wrong.any():
+        expected = "components of finite means, covariances and weights"
+        raise ValueError(message(expected, f"NaN or infinity in {_first(wrong)}"))
+    points = (covariance == 0).flatten(-2).all(-1)
+    if not points.any():
+        return mixture
+    size = moment_match(mixture)[1].diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True).sqrt()
+    alone = points & ~(size > 0)
+    if alone.any():
+        expected = "a mixture of some width, to which points in it are widened"
+        raise ValueError(message(expected, f"a covariance of 0 in {_first(alone)}"))
+    text = f"{int(points.sum())} of {points.numel()} components have collapsed to points: widened"
+    warnings.warn(text, stacklevel=3)
+    width = size * max(_THINNEST, 1e2 * torch.finfo(scale.dtype).eps) ** 0.5
+    least = width[..., None, None] * torch.eye(scale.shape[-1]).to(scale)
+    return Mixture(logits, loc, torch.where(points[..., None, None], least, scale))
+
+
+def _first(marked: Tensor) -> str:
+    """Return the name of the first component that is marked, among ``(*, K)``."""
+    *row, k = marked.nonzero()[0].tolist()
+    return f"component {k} of {marked.shape[-1]}" + (f", row {row}" if row else "")
+
+
 def _cholesky(matrix: Tensor) -> Tensor:
     """Return the lower factor of covariances ``(*, D, D)``.
 
@@ -224,15 +280,19 @@ def _cholesky(matrix: Tensor) -> Tensor:
     direction, it is widened to `_THINNEST` of its widest variance, with a warning.
 
     Raises:
-        ValueError: One is indefinite by more than rounding.
+        ValueError: One is indefinite by more than rounding, wholly 0, or not finite.
     """
     factor, failed = torch.linalg.cholesky_ex(matrix)
-    if not failed.any():
+    if not failed.any() and factor.isfinite().all():
         return factor
+    finite = matrix.isfinite().flatten(-2).all(-1)
+    if not finite.all():
+        text = f"NaN or infinity in {int((~finite).sum())} of {finite.numel()}"
+        raise ValueError(message("covariances that are finite", text))
     bad = failed > 0
     values, vectors = torch.linalg.eigh(_symmetric(matrix))
     widest, rounding = values.amax(-1, keepdim=True), torch.finfo(matrix.dtype).eps
-    if (values < -max(_ROUNDING, 1e3 * rounding) * widest)[bad].any():
+    if ((values < -max(_ROUNDING, 1e3 * rounding) * widest) | (widest <= 0))[bad].any():
         expected = "covariances that are positive definite"
         raise ValueError(message(expected, f"a variance of {values[bad].amin().item():.3g}"))
     values = values.maximum(max(_THINNEST, 1e2 * rounding) * widest)
