@@ -215,6 +215,7 @@ def test_the_users_generators_are_untouched():
     assert states() == before
 
 
+@pytest.mark.filterwarnings("ignore:None of the 3 statistics varies")
 def test_weights_choose_among_pairs():
     """Pairs of weight zero are not learned from."""
     prior = BoxPrior({"mass": (2.0, 6.0)})
@@ -242,7 +243,8 @@ def test_statistics_that_are_all_constant_leave_the_prior():
     data = linear_gaussian(600)
     data["summary"].zero_()
     net = posterior()
-    fit(net, data, epochs=40, lr=1e-2, progress=False)
+    with pytest.warns(UserWarning, match="None of the 3 statistics varies over 600 simulations"):
+        fit(net, data, epochs=40, lr=1e-2, progress=False)
     z = PRIOR.standardize(net.condition(torch.zeros(3)).sample((4000,), generator=generator(4)))
     assert z.mean(0).abs().max() < 0.2
     torch.testing.assert_close(z.std(0), torch.ones(2), rtol=0, atol=0.1)
@@ -301,7 +303,7 @@ def test_too_few_pairs_are_refused():
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0, 1.5])
 def test_all_or_nothing_cannot_be_held_out(fraction):
-    with pytest.raises(ValueError, match="a validation_fraction between 0 and 1"):
+    with pytest.raises(ValueError, match="a finite validation_fraction above 0 and below 1"):
         short_fit(posterior(), linear_gaussian(20), validation_fraction=fraction)
 
 
@@ -340,6 +342,51 @@ def test_weights_that_teach_nothing_are_refused(weight):
     data = TensorDict({"theta": theta, "summary": theta, "weight": weight}, [64])
     with pytest.raises(ValueError, match="finite weights of 0 or more"):
         fit(MixtureDensityPosterior(prior, 1), data, progress=False)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-200])
+def test_the_epoch_is_chosen_by_pairs_that_count(scale):
+    """Six of 400 pairs count, and hardly ever one of the tenth that is held out at random."""
+    data = linear_gaussian(400)
+    few = torch.zeros(400, dtype=torch.float64)
+    few[::75] = scale
+    one, other = posterior(), posterior()
+    report = short_fit(one, data.clone().set("weight", few))
+    assert report.pairs == 6
+    assert all(loss != 0 for loss in report.validation)
+    same = short_fit(other, data[::75].set("weight", torch.ones(6)))
+    assert report.validation == pytest.approx(same.validation)
+
+
+def test_weights_are_one_for_each_pair():
+    data = linear_gaussian(20)
+    with pytest.raises(ValueError, match=r"one weight per pair, shape \(20,\), got \(20, 3\)"):
+        short_fit(posterior(), data.clone().set("weight", torch.ones(20, 3)))
+    column = short_fit(posterior(), data.clone().set("weight", torch.ones(20, 1)))
+    assert column == short_fit(posterior(), data.clone().set("weight", torch.ones(20)))
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "said"),
+    [
+        ({"lr": "a"}, TypeError, "a finite lr above 0, got 'a'"),
+        ({"lr": -1.0}, ValueError, r"a finite lr above 0, got -1\.0"),
+        ({"lr": math.inf}, ValueError, "a finite lr above 0, got inf"),
+        ({"weight_decay": -1e-3}, ValueError, "a finite weight_decay of at least 0"),
+        ({"patience": 0}, ValueError, "patience to be positive, got 0"),
+        ({"validation_fraction": None}, TypeError, "above 0 and below 1, got None"),
+    ],
+)
+def test_rates_and_shares_are_numbers(options, error, said):
+    with pytest.raises(error, match=said):
+        short_fit(posterior(), linear_gaussian(20), **options)
+
+
+def test_complex_summaries_are_refused():
+    data = linear_gaussian(20)
+    data["summary"] = data["summary"].to(torch.complex64)
+    with pytest.raises(TypeError, match=r"real numbers in 'summary', got 'torch\.complex64'"):
+        short_fit(posterior(), data)
 
 
 @pytest.mark.parametrize("options", [{"epochs": 0}, {"batch_size": 0}])

@@ -167,7 +167,7 @@ def _loss(posterior: MixtureDensityPosterior, pairs: _Pairs, *, truncated: bool)
     weight = pairs.weight
     loss = pairs.volume - mixture.log_prob(pairs.z)
     total = torch.where(weight > 0, weight * loss, 0.0).sum()
-    return total / weight.sum().clamp_min(1e-12)
+    return total / weight.sum().clamp_min(torch.finfo(weight.dtype).tiny)
 
 
 def _check_loss(loss: Tensor) -> None:

@@ -17,8 +17,11 @@ from torch import Tensor
 from ..counts import check_count
 from ..errors import SimulationError, message
 from ..randomness import generator
+from ..scalars import check_number
 from .descent import descend
 from .features import FourierFeatures
+from .input_scaling import InputScaling
+from .losses import one_each
 from .posterior import MixtureDensityPosterior
 from .rows import Rows, mapped, parts
 
@@ -113,12 +116,16 @@ def fit(
 
     AdamW with one cycle of the learning rate: see :mod:`.descent`. After every epoch the loss on
     held-out pairs is computed, and the parameters of the best epoch are kept. Pairs that are not
-    finite are dropped and counted.
+    finite are dropped and counted; those of weight 0 are left out.
+
+    Warns if no statistic varies, so that there is nothing to learn, and of statistics that are
+    scaled by their quartiles because a few pairs lie absurdly far out: see :mod:`.input_scaling`.
 
     Args:
         posterior: Changed in place.
         data: Batch size ``(N,)``, or any other, which is taken for one row of pairs; ``"theta"``
-            ``(N, D)``, ``"summary"`` ``(N, L)``, of which counts become floats.
+            ``(N, D)``, ``"summary"`` ``(N, L)``, of which counts become floats; ``"weight"``, one
+            for each.
         epochs: At most so many passes.
         batch_size: Pairs per step.
         lr: Highest learning rate.
@@ -132,17 +139,22 @@ def fit(
 
     Raises:
         ValueError: For fewer than 4 usable pairs, shapes that do not match the posterior,
-            parameters outside the prior, or a share that is not between 0 and 1.
+            parameters outside the prior, weights that are not one for each pair or not finite, a
+            share that is not between 0 and 1, or a learning rate that is not positive.
         SimulationError: If no pair is finite, or the loss is not.
-        TypeError: The pairs are not a TensorDict, or a count is no whole number.
+        TypeError: The posterior is none, the pairs are not a TensorDict, a count is no whole
+            number, or a rate or share no number.
     """
+    if not isinstance(posterior, MixtureDensityPosterior):
+        raise TypeError(message("a MixtureDensityPosterior", type(posterior).__name__))
     if not isinstance(data, TensorDictBase):
         raise TypeError(message("pairs in a TensorDict of batch size (N,)", type(data).__name__))
-    data = _in_floats(data, posterior.theta_key, posterior.summary_key)
-    if not 0 < validation_fraction < 1:
-        raise ValueError(message("a validation_fraction between 0 and 1", validation_fraction))
-    for name, value in {"epochs": epochs, "batch_size": batch_size}.items():
+    check_number("validation_fraction", validation_fraction, above=0.0, below=1.0)
+    check_number("lr", lr, above=0.0)
+    check_number("weight_decay", weight_decay, least=0.0)
+    for name, value in {"epochs": epochs, "batch_size": batch_size, "patience": patience}.items():
         check_count(name, value)
+    data = _in_floats(data, posterior.theta_key, posterior.summary_key)
     keys = (posterior.theta_key, posterior.summary_key)
     data = data.select(*keys, "weight", strict=False)
     rows = _usable_rows(data, *keys)
@@ -150,13 +162,13 @@ def fit(
         warnings.warn(
             f"{dropped} of {len(data)} simulations are not finite: left out", stacklevel=2
         )
-    _check_pairs(posterior, Rows(data, rows))
+    rows = _check_pairs(posterior, Rows(data, rows))
     order = rows[torch.randperm(len(rows), generator=generator(seed, "split"))]
     held_out = min(max(1, round(validation_fraction * len(rows))), len(rows) - 2, _HELD_OUT)
     validation, train = data[order[:held_out]], Rows(data, order[held_out:])
     if rescale:
         summaries = (part.get(posterior.summary_key) for part in train.parts())
-        posterior.network.standardize_inputs(summaries)
+        _warn_of(posterior.network.standardize_inputs(summaries), Rows(data, rows), keys[1])
     posterior.seen = train[:_SEEN].get(posterior.summary_key)
     posterior.held_out = None if "weight" in data.keys() else validation  # noqa: SIM118
     trace = descend(
@@ -196,24 +208,44 @@ def _in_floats(data: TensorDictBase, *keys: NestedKey) -> TensorDictBase:
         if value is not None and (value.ndim != 2 or not value.shape[1]):
             expected = f"vectors in {key!r}, shape (N, size)"
             raise ValueError(message(expected, tuple(value.shape), hint="unsqueeze(-1)"))
+        if value is not None and value.is_complex():
+            hint = "its real and imaginary parts, or magnitude and phase"
+            raise TypeError(message(f"real numbers in {key!r}", str(value.dtype), hint=hint))
         if value is not None and not value.is_floating_point():
             data.set(key, value.to(torch.get_default_dtype()))
     return data
 
 
-def _check_pairs(posterior: MixtureDensityPosterior, pairs: Rows) -> None:
+def _warn_of(scaling: InputScaling, pairs: Rows, key: NestedKey) -> None:
+    """Warn of statistics that say nothing, and of pairs that lie absurdly far out."""
+    count = len(scaling.scale)
+    if scaling.scale.isinf().all():
+        text = (
+            f"None of the {count} statistics varies over {len(pairs)} simulations: these data say "
+            "nothing about the parameters, and the posterior is what they were drawn from, the "
+            "prior if it was. Do the parameters reach the simulator, and the statistics see it?"
+        )
+        warnings.warn(text, stacklevel=3)
+    for column in scaling.absurd.nonzero().flatten().tolist()[:3]:
+        values = torch.cat([part.get(key)[:, column] for part in pairs.parts()])
+        row = int((values - scaling.shift[column]).abs().argmax())
+        text = (
+            f"Statistic {column} of pair {int(pairs.index[row])} is {values[row]:.3g}, so far from "
+            f"those of the others that they could not be told apart beside it (median "
+            f"{scaling.shift[column]:.3g}): scaled by the quartiles. Did this simulation diverge?"
+        )
+        warnings.warn(text, stacklevel=3)
+
+
+def _check_pairs(posterior: MixtureDensityPosterior, pairs: Rows) -> Tensor:
+    """Return which rows count, those whose weight is not 0."""
+    pairs = _weighted(pairs)
     if len(pairs) < 4:
         raise ValueError(message("at least 4 usable pairs", len(pairs), hint="simulate more"))
     expected = (len(posterior.prior.names), len(posterior.network.shift))
     got = tuple(pairs[:1].get(k).shape[-1] for k in (posterior.theta_key, posterior.summary_key))
     if got != expected:
         raise ValueError(message("pairs with (D, L) of the posterior, " + str(expected), got))
-    if "weight" in pairs.pairs.keys():  # noqa: SIM118
-        weight = torch.cat([part.get("weight") for part in pairs.parts()])
-        good = weight.isfinite() & (weight >= 0)
-        if not good.all() or not weight.any():
-            text = f"{int((~good).sum())} that are not, sum {weight.sum().item():.3g}"
-            raise ValueError(message("finite weights of 0 or more, some positive", text))
     theta = (part.get(posterior.theta_key) for part in pairs.parts())
     inside = torch.cat([posterior.prior.contains(part) for part in theta])
     if not inside.all():
@@ -226,6 +258,20 @@ def _check_pairs(posterior: MixtureDensityPosterior, pairs: Rows) -> None:
                 hint="the prior that the parameters were drawn from",
             )
         )
+    return pairs.index
+
+
+def _weighted(pairs: Rows) -> Rows:
+    """Return the pairs whose weight is not 0: if only others were held out, none would count."""
+    if "weight" not in pairs.pairs.keys():  # noqa: SIM118
+        return pairs
+    given = torch.cat([part.get("weight") for part in pairs.parts()])
+    weight = one_each("weight", given, pairs.index.shape)
+    good = weight.isfinite() & (weight >= 0)
+    if not good.all() or not weight.any():
+        text = f"{int((~good).sum())} that are not, sum {weight.sum().item():.3g}"
+        raise ValueError(message("finite weights of 0 or more, some positive", text))
+    return Rows(pairs.pairs, pairs.index[weight > 0])
 
 
 def select_lengthscale(

@@ -10,7 +10,7 @@ proposal :math:`\tilde p`: see :mod:`torchrl_bayessim.inference.proposals`.
 
 from __future__ import annotations
 
-__all__ = ["PosteriorLoss"]
+__all__ = ["PosteriorLoss", "one_each"]
 
 from dataclasses import dataclass
 from typing import Literal
@@ -121,14 +121,14 @@ class PosteriorLoss(LossModule):
         """Return the weight of every pair, 0 where masked."""
         shape = theta.shape[:-1]
         weight = tensordict.get(self.tensor_keys.weight, None)
-        weight = theta.new_ones(shape) if weight is None else _one_each("weight", weight, shape)
+        weight = theta.new_ones(shape) if weight is None else one_each("weight", weight, shape)
         for key in dict.fromkeys([self.tensor_keys.mask, ("collector", "mask")]):
             mask = tensordict.get(key, None)
             if mask is None:
                 continue
             if mask.dtype != torch.bool:
                 raise TypeError(message(f"booleans in {key!r}", str(mask.dtype)))
-            weight = torch.where(_one_each("mask", mask, shape), weight, 0.0)
+            weight = torch.where(one_each("mask", mask, shape), weight, 0.0)
         if not (weight >= 0).all() or weight.isinf().any():
             bad = weight[~(weight >= 0) | weight.isinf()]
             expected = "finite weights of 0 or more"
@@ -136,8 +136,12 @@ class PosteriorLoss(LossModule):
         return weight
 
 
-def _one_each(kind: str, values: Tensor, shape: torch.Size) -> Tensor:
-    """Return one value per pair, in the pairs' shape."""
+def one_each(kind: str, values: Tensor, shape: torch.Size) -> Tensor:
+    """Return one value per pair, in the pairs' shape.
+
+    Raises:
+        ValueError: There is another number of values.
+    """
     if values.numel() != shape.numel():
         expected = f"one {kind} per pair, shape {tuple(shape)}"
         raise ValueError(message(expected, tuple(values.shape)))

@@ -13,13 +13,14 @@ from torch import Tensor, nn
 from ..counts import check_count
 from ..errors import message
 from .features import Features
+from .input_scaling import InputScaling, input_scaling
 from .mixtures import Mixture
-from .rows import spread
 
 Covariance = Literal["diagonal", "full"]
 WIDEST = 4.0  # of a component, in prior deviations: nearly flat over a box, which spans 3.5
 STEEPEST = 100.0  # ratio of a marginal to a conditional deviation
 LINEAR = 3.0  # deviations within which compression changes little
+_FARTHEST = 1e6  # deviations of an input: one far out says no more than that
 FLOOR = 1e-8  # of a variance, in standardised coordinates: a deviation of 1e-4 prior deviations
 
 
@@ -90,16 +91,15 @@ class MixtureDensityNetwork(nn.Module):
         self.register_buffer("scale", torch.ones(features.dim))
         self.register_buffer("widening", torch.ones(()))
 
-    def standardize_inputs(self, summaries: Tensor | Iterable[Tensor]) -> None:
+    def standardize_inputs(self, summaries: Tensor | Iterable[Tensor]) -> InputScaling:
         """Set the input scaling from training summaries ``(N, L)``, or from parts of them.
 
-        Constant ones are ignored.
+        Constant ones are ignored; see :mod:`.input_scaling` for those of absurd rows.
         """
-        whole = isinstance(summaries, Tensor)
-        mean, sd, largest = spread([summaries] if whole else summaries)
-        constant = sd <= 1e-6 * (1e-12 + largest)
-        self.shift.copy_(mean)
-        self.scale.copy_(torch.where(constant, torch.inf, sd))
+        found = input_scaling([summaries] if isinstance(summaries, Tensor) else summaries)
+        self.shift.copy_(found.shift)
+        self.scale.copy_(found.scale)
+        return found
 
     def scaled(self, summary: Tensor) -> Tensor:
         """Return the standardised inputs of the features."""
@@ -107,7 +107,7 @@ class MixtureDensityNetwork(nn.Module):
             raise ValueError(
                 message(f"summaries of shape (*, {len(self.shift)})", tuple(summary.shape))
             )
-        scaled = (summary - self.shift) / self.scale
+        scaled = ((summary - self.shift) / self.scale).clamp(-_FARTHEST, _FARTHEST)
         if self.compress:
             scaled = LINEAR * (scaled / LINEAR).asinh()
         return scaled.to(self.shift.dtype)
