@@ -7,6 +7,7 @@ from torchrl_bayessim.inference.misspecification import doubts, piled_up, strang
 from torchrl_bayessim.inference.physics_posterior import PhysicsPosterior
 from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
 from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
+from torchrl_bayessim.randomness import generator
 
 BOX = BoxPrior({"mass": (2.0, 6.0), "drag": (0.01, 1.0)}, log=["drag"])
 
@@ -134,3 +135,12 @@ def test_a_posterior_inside_or_as_wide_as_the_prior_is_at_no_edge(scale):
 def test_a_prior_without_edges_has_none():
     prior = GaussianPrior({"a": (0.0, 1.0), "b": (0.0, 1.0)})
     assert piled_up(gaussian(prior, [50.0, 0.0], 0.1)) == []
+
+
+def test_one_absurd_simulation_hides_no_strange_summary():
+    rows = torch.randn(200, 2, generator=generator("rows"))
+    rows[17, 1] = 3e38
+    share, deviation = strangeness(rows, torch.tensor([0.0, 30.0]))
+    assert share == pytest.approx(2 / 201)  # the absurd one lies further out
+    assert deviation[1] > 20
+    assert strangeness(rows, torch.zeros(2))[0] > 0.1

@@ -56,7 +56,8 @@ def strangeness(summaries: Tensor, observed: Tensor) -> tuple[float, Tensor]:
     rows = torch.cat([observed[None].double(), simulated])
     # quartiles, which long tails do not move; where most rows agree, the standard deviation
     low, median, high = rows.quantile(torch.tensor([0.25, 0.5, 0.75], dtype=rows.dtype), 0)
-    rounding = 1e-6 * rows.abs().amax(0) + 1e-12
+    size = rows.abs().quantile(0.95, 0, interpolation="lower")  # which few absurd rows do not set
+    rounding = 1e-6 * size + 1e-12
     spread = torch.where(high - low > rounding, (high - low) / 1.35, rows.std(0))
     rows = (rows - median) / torch.maximum(spread, rounding)
     distance = torch.cdist(rows, rows, p=torch.inf).fill_diagonal_(torch.inf)
