@@ -10,7 +10,7 @@ ROOT = Path(torchrl_bayessim.__file__).parent
 # From the bottom up. A module may import from the layers below its own, and from its own layer as
 # long as no cycle arises.
 LAYERS = [
-    {"counts", "errors", "randomness", "scalars", "whole_file"},
+    {"counts", "errors", "kinds", "randomness", "scalars", "whole_file"},
     {
         "sources",
         "sbi_source",

@@ -285,7 +285,7 @@ def test_parameters_may_be_arrays_and_need_a_gradient():
         (
             {"outputs": "qpos"},
             TypeError,
-            r"a tuple of names of outputs, got 'qpos'. Try: \('qpos',",
+            r"a sequence of keys, got 'qpos'. Try: \('qpos',",
         ),
         ({"threads": 0}, ValueError, "threads to be a positive integer, got 0"),
         ({"threads": -1}, ValueError, "threads to be a positive integer, got -1"),

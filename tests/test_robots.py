@@ -205,7 +205,7 @@ def test_what_was_logged_may_have_other_names():
     renamed["next", "joints", "angle"][2, 1] = torch.nan
     with pytest.raises(ValueError, match=r"'next', 'joints', 'angle'.*trajectory 0 at step 2"):
         RecordedLogs(pad([renamed]), **names)
-    with pytest.raises(TypeError, match=r"a sequence of entries.*Try: measured=\('angle',\)"):
+    with pytest.raises(TypeError, match=r"measured= to be a sequence.*Try: \('angle',\)"):
         RecordedLogs(pad([log(3)]), measured="angle")
 
 
@@ -240,7 +240,7 @@ def test_a_robot_that_diverges_is_named():
 def test_what_is_no_parameter_and_no_list_of_entries_is_refused():
     with pytest.raises(TypeError, match=r"numbers, the parameters θ of shape \(D,\), got 'long'"):
         SurrogateRobot(batched(), "long", max_steps=5)
-    with pytest.raises(TypeError, match=r"sequence of entries.*Try: measured=\('observation',\)"):
+    with pytest.raises(TypeError, match=r"measured= to be a sequence.*Try: \('observation',\)"):
         SurrogateRobot(batched(), [0.5], max_steps=5, measured="observation")
 
 

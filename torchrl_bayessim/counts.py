@@ -7,14 +7,19 @@ __all__ = ["check_count"]
 from operator import index
 from typing import Any
 
+import numpy as np
+import torch
+
 from .errors import message
+
+_BOOLEANS = (torch.bool, np.dtype(bool))  # which Python counts as 0 and 1
 
 
 def check_count(name: str, value: Any, *, least: int = 1) -> None:
     """Refuse what is not a whole number of at least ``least``.
 
     Raises:
-        TypeError: It is not a whole number: ``16.0`` is none, as for :func:`range`.
+        TypeError: It is not a whole number: ``16.0`` is none, as for :func:`range`, nor ``True``.
         ValueError: It is too small.
 
     Example:
@@ -24,6 +29,8 @@ def check_count(name: str, value: Any, *, least: int = 1) -> None:
         TypeError: expected a whole number of episodes, got 2.5.
     """
     try:
+        if isinstance(value, bool) or getattr(value, "dtype", None) in _BOOLEANS:
+            raise TypeError
         number = index(value)
     except TypeError:
         hint = f"{int(value)}" if isinstance(value, float) and value.is_integer() else ""

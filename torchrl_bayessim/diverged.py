@@ -6,7 +6,7 @@ collector, because no policy has an action for it, and would spoil the learner t
 
 from __future__ import annotations
 
-__all__ = ["UndisturbedPolicy", "finite_rows"]
+__all__ = ["UndisturbedPolicy", "check_policy", "finite_rows"]
 
 import warnings
 from collections.abc import Sequence
@@ -16,6 +16,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleWrapper
 
 from .errors import SimulationError, message
+from .kinds import check_function
 
 
 class UndisturbedPolicy(TensorDictModuleWrapper):
@@ -46,6 +47,16 @@ class UndisturbedPolicy(TensorDictModuleWrapper):
         for key, value in disturbed.items():
             out.set(key, value)
         return out
+
+
+def check_policy(policy: object) -> None:
+    """Refuse what cannot act; None stands for random actions.
+
+    Raises:
+        TypeError: It cannot.
+    """
+    if policy is not None:
+        check_function("a policy, a TensorDictModule, or None for random actions", policy)
 
 
 def finite_rows(batch: TensorDictBase, keys: Sequence[NestedKey]) -> tuple[TensorDictBase, int]:

@@ -19,7 +19,7 @@ from __future__ import annotations
 __all__ = ["Experiment", "excite", "expected_information", "replayed"]
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,6 +27,7 @@ from torch import Tensor
 from .counts import check_count
 from .envs.task import Task
 from .errors import message
+from .kinds import check_function, check_kind, real_numbers
 from .physics.protocol import Physics
 from .randomness import generator
 from .replay import Replay
@@ -108,8 +109,10 @@ def excite(
         seed: Same seed, same experiment.
 
     Raises:
-        TypeError: For counts that are no whole numbers.
-        ValueError: For counts that are not positive, or fewer than 2 knots.
+        TypeError: For counts that are no whole numbers, bounds, noise or parameters that are no
+            numbers, and what is no simulator.
+        ValueError: For counts that are not positive, fewer than 2 knots, parameters that are not
+            finite or fewer than 2, and lowest actions that are not below the highest.
 
     Example:
         >>> simulate = lambda theta, actions: theta[:, None, None] * actions.cumsum(1)
@@ -122,7 +125,13 @@ def excite(
     for name, value in counts.items():
         check_count(name, value)
     check_count("knots", knots, least=2)
-    low, high = (torch.as_tensor(bound).double() for bound in bounds)
+    check_function("simulate, a function of parameters and actions", simulate)
+    theta = real_numbers("draws of parameters, shape (P, D)", theta)
+    noise = real_numbers("deviations of the noise, shape (Y,)", noise)
+    if theta.ndim != 2 or len(theta) < 2 or not theta.isfinite().all():
+        got = f"shape {tuple(theta.shape)}"
+        raise ValueError(message("two or more finite draws of parameters, shape (P, D)", got))
+    low, high = _bounds(bounds)
     g = generator(seed, "excitation")
     mean = torch.zeros(knots, len(low), dtype=torch.float64)
     deviation = torch.ones_like(mean)
@@ -137,6 +146,19 @@ def excite(
         elite = points[order[: max(2, round(_ELITE * candidates))]]
         mean, deviation = elite.mean(0), elite.std(0) + 0.05
     return Experiment(_actions(best[None], low, high, steps)[0], most)
+
+
+def _bounds(bounds: object) -> tuple[Tensor, Tensor]:
+    """Return the lowest and the highest actions, each of shape ``(A,)``."""
+    expected = "bounds=(lowest, highest) actions, each of shape (A,)"
+    check_kind(expected, bounds, tuple, list)
+    pair: Any = bounds
+    if len(pair) != 2:
+        raise ValueError(message(expected, f"{len(pair)} parts"))
+    low, high = (real_numbers(expected, bound).double() for bound in pair)
+    if low.ndim != 1 or low.shape != high.shape or not len(low) or not (low < high).all():
+        raise ValueError(message(f"{expected}, low < high", (low.tolist(), high.tolist())))
+    return low, high
 
 
 def _actions(points: Tensor, low: Tensor, high: Tensor, steps: int) -> Tensor:

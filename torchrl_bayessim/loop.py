@@ -39,6 +39,7 @@ from .evidence import Evidence, EvidenceSimulator
 from .inference.fit import FitReport
 from .inference.physics_posterior import PhysicsPosterior
 from .inference.refinement import PosteriorRefinement
+from .kinds import check_function, check_kind
 from .ray_collectors import RayCollectors
 from .real_trajectories import (
     check_columns,
@@ -48,6 +49,7 @@ from .real_trajectories import (
     simulated_columns,
 )
 from .robots import RealSystem, RecordedLogs
+from .simulate import check_parts
 from .sources import Defensive, check_prior_share
 from .summaries import SummaryStatistics
 from .trajectories import concatenate, next_key
@@ -133,7 +135,7 @@ class SimToRealLoop:
         progress: Whether to show progress bars; those of fits as ``fit_options`` say, if they do.
 
     Raises:
-        TypeError: For a count that is no whole number.
+        TypeError: For a count that is no whole number, or a part that is of another kind.
         ValueError: For a count that is too small, a ``prior_share`` that is no probability, or
             statistics of what the simulator or the logs do not have; in a round, for a robot whose
             answer lacks what they read or has other sizes than the simulator's, and for episodes
@@ -168,6 +170,12 @@ class SimToRealLoop:
         collectors: RayCollectors | None = None,
         progress: bool = True,
     ) -> None:
+        check_parts(env, statistics, randomizer)
+        check_kind("a PosteriorRefinement", refinement, PosteriorRefinement)
+        for role, owner, method in ("learner", learner, "update"), ("robot", robot, "rollouts"):
+            check_function(f"a {role} with {method}()", getattr(owner, method, None))
+        policy = getattr(learner, "policy", None)
+        check_kind("a learner with a policy, a TensorDictModule", policy, TensorDictModuleBase)
         self.settings: dict[str, Any] = {
             "horizon": horizon,
             "episodes": episodes,
@@ -350,8 +358,11 @@ class SimToRealLoop:
         """Go on from a state, to the numbers of the unbroken run.
 
         Raises:
+            TypeError: It is no mapping.
             ValueError: If the state was made with other settings, or is not a loop's.
         """
+        check_kind("the state of a loop", state, Mapping)
+        state = dict(state)
         missing = [name for name in self.state_dict() if name not in state]
         if missing:
             expected = "the state of a loop, with an entry"

@@ -7,7 +7,7 @@ random number generators needs to be kept in a checkpoint.
 
 from __future__ import annotations
 
-__all__ = ["generator", "isolated", "seed_from"]
+__all__ = ["check_draw_key", "generator", "isolated", "seed_from"]
 
 import hashlib
 import random
@@ -16,6 +16,8 @@ from contextlib import contextmanager
 
 import numpy as np
 import torch
+
+from .kinds import check_kind
 
 
 def seed_from(*key: int | str) -> int:
@@ -29,6 +31,15 @@ def seed_from(*key: int | str) -> int:
     """
     digest = hashlib.blake2b(repr(key).encode(), digest_size=8).digest()
     return int.from_bytes(digest, "little") >> 1
+
+
+def check_draw_key(key: object) -> None:
+    """Refuse what is no key of draws.
+
+    Raises:
+        TypeError: It is no tuple, or list, of numbers and strings.
+    """
+    check_kind("a key of draws, a tuple of whole numbers and strings", key, tuple, list)
 
 
 def generator(*key: int | str) -> torch.Generator:

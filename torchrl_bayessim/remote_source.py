@@ -24,7 +24,8 @@ from torch import Tensor
 from torchrl.collectors import BaseCollector
 
 from .errors import message
-from .sources import Source, draw, names_of
+from .randomness import check_draw_key
+from .sources import Source, check_source, draw, names_of
 
 
 class PolicyWithSource(TensorDictModuleWrapper):
@@ -68,7 +69,7 @@ def push_source(collector: BaseCollector, source: Source, *, key: tuple[int | st
         key: What the draws are for, e.g. ``(seed, round)``: same key, same table.
 
     Raises:
-        TypeError: The policy carries no table.
+        TypeError: The policy carries no table, or the source cannot be sampled.
         ValueError: ``source`` has other parameters than the policy was made for.
     """
     policy: Any = getattr(collector, "policy", None)
@@ -81,6 +82,8 @@ def push_source(collector: BaseCollector, source: Source, *, key: tuple[int | st
                 hint="build the collector with PolicyWithSource(policy, prior)",
             )
         )
+    check_source(source)
+    check_draw_key(key)
     names = names_of(source)
     if None not in (names, carrier.names) and names != carrier.names:
         raise ValueError(message(f"a source over {carrier.names}", names))

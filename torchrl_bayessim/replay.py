@@ -28,6 +28,7 @@ from .envs.stepper import Stepper
 from .envs.task import Readings, Task
 from .envs.tasks.catalogue import as_task
 from .errors import message
+from .kinds import check_function, check_kind
 from .physics.protocol import Physics
 
 Hook = Callable[[Readings], Mapping[str, Tensor]]
@@ -75,7 +76,8 @@ class Replay:
     Raises:
         ValueError: The segments disagree in number, lack what they need, or are not finite;
             ``dt`` is not a multiple of the time step; ``threads`` is no positive integer.
-        TypeError: ``task`` is none; ``outputs`` is one string.
+        TypeError: ``task`` or ``physics`` is none; ``outputs`` is no sequence of names; the
+            segments are no numbers by name, or ``dt`` is none.
 
     Attributes:
         task: The task.
@@ -97,6 +99,8 @@ class Replay:
         self.task = as_task(task)
         if dt is not None:
             self.task = replace(self.task, frame_skip=substeps_of(self.task, dt))
+        if physics is not None:
+            check_kind("physics with names, write and read", physics, Physics)
         self.physics = physics
         check_counts(threads=threads)
         self._names = names_of(outputs)
@@ -149,7 +153,10 @@ class Replay:
         Raises:
             ValueError: ``theta`` has another shape, is not finite, or there is no ``physics`` to
                 set; ``every`` is unknown.
+            TypeError: ``theta`` is no numbers, or the hook no function.
         """
+        if hook is not None:
+            check_function("a hook, a function of readings", hook)
         count = 1 if theta is None else self._write(theta)
         rows = np.arange(count * self.num_segments)
         stepper = self._stepper

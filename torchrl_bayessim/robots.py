@@ -21,9 +21,10 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from .counts import check_count
-from .diverged import UndisturbedPolicy
+from .diverged import UndisturbedPolicy, check_policy
 from .errors import SimulationError, message
-from .randomness import isolated, seed_from
+from .kinds import check_key, check_keys, check_kind, real_numbers
+from .randomness import check_draw_key, isolated, seed_from
 from .real_trajectories import check_real, first_not_finite
 from .sources import Grid
 from .trajectories import concatenate, first_trajectories, next_key
@@ -65,11 +66,11 @@ class SurrogateRobot:
 
     Raises:
         SimulationError: In a call: what was measured is not finite.
-        TypeError: θ is not made of numbers, ``measured`` is one name and no sequence, or a count
-            is no whole number.
-        ValueError: For a measured entry that is not observed, no steps, or an environment that
-            draws its own parameters; in a call, for no episodes, or a policy that reads what is not
-            measured.
+        TypeError: ``env`` is no environment, θ is not made of numbers, ``measured`` is one name and
+            no sequence, or a count is no whole number; in a call, for what is no policy.
+        ValueError: For θ of another shape or not finite, a measured entry that is not observed, no
+            steps, or an environment that draws its own parameters; in a call, for no episodes, or a
+            policy that reads what is not measured.
 
     Example:
         >>> from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
@@ -93,13 +94,14 @@ class SurrogateRobot:
         measured: Sequence[NestedKey] = ("observation",),
     ) -> None:
         check_count("max_steps", max_steps)
+        check_kind("a TorchRL environment", env, EnvBase)
         _check_not_randomized(env)
-        _check_sequence(measured)
+        check_keys("measured", measured)
         self.max_steps, self.measured = max_steps, list(measured)
-        try:
-            theta = torch.as_tensor(theta, dtype=torch.float32)
-        except (TypeError, ValueError):
-            raise TypeError(message("numbers, the parameters θ of shape (D,)", theta)) from None
+        expected = "numbers, the parameters θ of shape (D,)"
+        theta = real_numbers(expected, theta, torch.float32)
+        if theta.ndim != 1 or not len(theta) or not theta.isfinite().all():
+            raise ValueError(message(f"finite {expected}", theta.tolist()))
         self._theta = theta
         self._randomizer = DomainRandomizer(Grid(theta[None]))
         self._env = TransformedEnv(env, self._randomizer, auto_unwrap=False)
@@ -129,6 +131,8 @@ class SurrogateRobot:
     ) -> TensorDictBase:
         """Return trajectories ``[episodes, T]`` with a ``"mask"``, made by ``policy``."""
         check_count("episodes", episodes)
+        check_draw_key(key)
+        check_policy(policy)
         for entry in getattr(policy, "in_keys", ()):
             if entry in self._observed and entry not in self.measured:
                 raise ValueError(
@@ -158,12 +162,6 @@ class SurrogateRobot:
         following = [*self.measured, "reward", "done", "terminated", "truncated"]
         reported = [*self.measured, "action", "mask", *(next_key(entry) for entry in following)]
         return real.select(*reported, strict=False)
-
-
-def _check_sequence(measured: Sequence[NestedKey]) -> None:
-    if isinstance(measured, str):
-        hint = f"measured=({measured!r},)"
-        raise TypeError(message("a sequence of entries to measure", measured, hint=hint))
 
 
 def _check_not_randomized(env: EnvBase) -> None:
@@ -197,7 +195,7 @@ class RecordedLogs:
 
     Raises:
         TypeError: For what is not a TensorDict, a mask that is not of booleans, or ``measured``
-            that is one name and no sequence.
+            or ``action_key`` that are no keys.
         ValueError: For no trajectory, missing entries, or measurements that are not finite.
     """
 
@@ -210,7 +208,8 @@ class RecordedLogs:
         measured: Sequence[NestedKey] = ("observation",),
         action_key: NestedKey = "action",
     ) -> None:
-        _check_sequence(measured)
+        check_keys("measured", measured)
+        check_key("action_key", action_key)
         values = [*measured, action_key, *(next_key(entry) for entry in measured)]
         check_real(trajectories, values)
         self.trajectories, self._entries = trajectories, (*values, "mask")

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from .errors import message
+from .kinds import check_keys, check_names
 
 
 class SbiSource:
@@ -31,8 +32,8 @@ class SbiSource:
         **options: For the posterior's ``sample``, such as ``max_sampling_time``.
 
     Raises:
-        TypeError: ``posterior`` has no ``sample``.
-        ValueError: The draws are not as many as the names.
+        TypeError: ``posterior`` has no ``sample``, or a name is no string.
+        ValueError: A name comes twice, or the draws are not as many as the names.
 
     Example:
         >>> class Posterior:
@@ -54,6 +55,8 @@ class SbiSource:
     ) -> None:
         if not callable(getattr(posterior, "sample", None)):
             raise TypeError(message("an sbi posterior with `sample`", type(posterior).__name__))
+        check_keys("names", names)
+        check_names("names of parameters", names)
         self.posterior, self.observed = posterior, observed
         self.names, self.options = tuple(names), options
 

@@ -18,12 +18,14 @@ def check_number(
     least: float = -math.inf,
     above: float = -math.inf,
     below: float = math.inf,
+    most: float = math.inf,
 ) -> None:
     """Refuse what is no finite number, or lies outside the bounds.
 
     Raises:
         TypeError: It is no number.
-        ValueError: It is not finite, less than ``least``, or not between ``above`` and ``below``.
+        ValueError: It is not finite, less than ``least``, more than ``most``, or not between
+            ``above`` and ``below``.
 
     Example:
         >>> check_number("lr", 1e-3, above=0.0)
@@ -31,11 +33,11 @@ def check_number(
         Traceback (most recent call last):
         TypeError: expected a finite lr above 0, got 'fast'.
     """
-    bounds = {" of at least": least, " above": above, " below": below}
+    bounds = {" of at least": least, " of at most": most, " above": above, " below": below}
     said = [f"{words} {bound:g}" for words, bound in bounds.items() if math.isfinite(bound)]
     expected = f"a finite {name}{' and'.join(said)}"
     if not isinstance(value, Real) or isinstance(value, bool):
         raise TypeError(message(expected, value))
     number = float(value)
-    if not (math.isfinite(number) and number >= least and above < number < below):
+    if not (math.isfinite(number) and least <= number <= most and above < number < below):
         raise ValueError(message(expected, value))

@@ -7,7 +7,14 @@ here; for recorded data, :class:`.replay_actions.ReplayActions` repeats the reco
 
 from __future__ import annotations
 
-__all__ = ["collect_summaries", "make_collector", "next_batch", "simulate", "summaries_in_turn"]
+__all__ = [
+    "check_parts",
+    "collect_summaries",
+    "make_collector",
+    "next_batch",
+    "simulate",
+    "summaries_in_turn",
+]
 
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
@@ -22,8 +29,9 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 
 from .counts import check_count
-from .diverged import UndisturbedPolicy
+from .diverged import UndisturbedPolicy, check_policy
 from .errors import PhysicsError, SimulationError, message
+from .kinds import check_function, check_kind
 from .pairs import counted, empty_pairs, fill_parameters, fill_summaries
 from .randomness import isolated, seed_from
 from .sources import Grid
@@ -51,6 +59,17 @@ def make_collector(env: EnvBase, policy: TensorDictModuleBase | None, *, steps: 
             total_frames=-1,
             auto_register_policy_transforms=False,
         )
+
+
+def check_parts(env: object, statistics: object, randomizer: object) -> None:
+    """Refuse what pairs cannot be simulated with.
+
+    Raises:
+        TypeError: One is of another kind.
+    """
+    check_kind("a TorchRL environment", env, EnvBase)
+    check_kind("SummaryStatistics", statistics, SummaryStatistics)
+    check_kind("a DomainRandomizer", randomizer, DomainRandomizer)
 
 
 def next_batch(collector: BaseCollector) -> Any:
@@ -230,7 +249,8 @@ def simulate(
         progress: Whether to show a progress bar.
 
     Raises:
-        TypeError: A count is no whole number.
+        TypeError: A count is no whole number; there is no environment, policy, statistics or
+            randomizer where one should be.
         ValueError: A count is not positive, or the collectors have other environments.
         FileExistsError: There is such a folder.
 
@@ -248,10 +268,13 @@ def simulate(
         ...          max_steps=30, progress=False)["summary"].shape
         torch.Size([100, 28])
     """
+    check_parts(env, statistics, randomizer)
+    check_policy(policy)
     counts = {"pairs": pairs, "max_steps": max_steps, "trajectories": trajectories}
     for name, value in counts.items():
         check_count(name, value)
     if collectors is not None:
+        check_function("RayCollectors", getattr(collectors, "check", None))
         collectors.check(env)
     asked: dict[str, Any] = {"trajectories": trajectories, "key": (seed,)}
     with nullcontext() if folder is None else replacing_folder(folder) as beside:

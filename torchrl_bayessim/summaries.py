@@ -34,6 +34,7 @@ from torch import Tensor
 
 from .counts import check_count
 from .errors import message
+from .kinds import check_key, check_kind
 from .trajectories import first_trajectories, next_key
 
 Summary = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
@@ -221,7 +222,8 @@ class SummaryStatistics(TensorDictModuleBase):
         theta_key: Key of the parameters, which are handed on where present.
 
     Raises:
-        TypeError: For what is not a function, or angles that are no sequence of columns.
+        TypeError: For what is not a function, angles that are no sequence of columns, or keys that
+            are none; in a call, for what is no TensorDict.
         ValueError: For no functions; in a call, for discrete actions given as indices, no step, no
             batch size, or observations that are no vectors.
         KeyError: In a call, for a missing entry.
@@ -250,6 +252,9 @@ class SummaryStatistics(TensorDictModuleBase):
             if not callable(function):
                 expected = "functions of (state, action, next_state, mask)"
                 raise TypeError(message(expected, function, hint="summaries.linear_dynamics"))
+        keys = {"observation": observation_key, "action": action_key, "theta": theta_key}
+        for name, key in {**keys, "out": out_key}.items():
+            check_key(f"{name}_key", key)
         self.functions, self.angles = functions, _columns(angles)
         self.observation_key, self.action_key = observation_key, action_key
         self.theta_key, self.one_hot = theta_key, one_hot
@@ -293,6 +298,7 @@ class SummaryStatistics(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``{"summary": (*, L)[, "theta": (*, D)]}`` of trajectories ``[*, T]``."""
+        check_kind("trajectories in a TensorDict", tensordict, TensorDictBase)
         if not tensordict.ndim:
             raise ValueError(message("trajectories of batch size [*, T]", "no batch size"))
         tensordict = self._masked(tensordict)
@@ -328,6 +334,7 @@ class SummaryStatistics(TensorDictModuleBase):
 
     def _masked(self, trajectories: TensorDictBase) -> TensorDictBase:
         """Return trajectories with a ``"mask"``: of each row's first one, unless there is one."""
+        check_kind("trajectories in a TensorDict", trajectories, TensorDictBase)
         mask = trajectories.get("mask", None)
         if mask is None:
             _check_entries(trajectories, self.in_keys)
@@ -384,7 +391,7 @@ class SummaryStatistics(TensorDictModuleBase):
 def _columns(angles: Sequence[int]) -> tuple[int, ...]:
     try:
         return tuple(index(column) for column in angles)
-    except TypeError:
+    except (TypeError, RuntimeError):
         expected = "a sequence of columns of the observation that are angles"
         raise TypeError(message(expected, angles, hint="angles=(0,)")) from None
 

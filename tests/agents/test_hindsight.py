@@ -149,9 +149,9 @@ def test_unfinished_episodes_are_refused():
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"share": 1.1}, r"relabelled transitions in \[0, 1\], got 1.1"),
+        ({"share": 1.1}, r"share of relabelled transitions .* at most 1, got 1\.1"),
         ({"capacity": 0}, "transitions of capacity to be positive, got 0"),
-        ({"moving": -1.0}, "not negative, or None, got -1.0"),
+        ({"moving": -1.0}, r"distance moved of at least 0, got -1\.0"),
     ],
 )
 def test_impossible_settings_are_refused(options, match):

@@ -308,7 +308,7 @@ def test_a_task_is_made_of_a_model():
     for model in (None, "robot.xml"):
         with pytest.raises(TypeError, match=r"an MjModel, got .*Try: mujoco.MjModel.from_xml_path"):
             Task(model=model, frame_skip=1)
-    with pytest.raises(TypeError, match=r"names of outputs, got 'qpos'. Try: \('qpos',\)"):
+    with pytest.raises(TypeError, match=r"a sequence of keys, got 'qpos'. Try: \('qpos',\)"):
         pendulum(outputs="qpos")
 
 

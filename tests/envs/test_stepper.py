@@ -171,7 +171,7 @@ def test_a_fatal_error_without_a_message_is_still_an_error():
 @pytest.mark.parametrize(
     ("change", "error", "match"),
     [
-        ({"outputs": "qpos"}, TypeError, r"a tuple of names of outputs, got 'qpos'"),
+        ({"outputs": "qpos"}, TypeError, "outputs= to be a sequence of keys, got 'qpos'"),
         ({"threads": 0}, ValueError, "threads to be a positive integer, got 0"),
     ],
 )

@@ -270,7 +270,7 @@ def test_lists_and_arrays_may_be_observed(observed):
 @pytest.mark.parametrize(
     ("bad", "error", "text"),
     [
-        ({"observed": "x"}, TypeError, "numbers, the summaries of real trajectories, got 'str'"),
+        ({"observed": "x"}, TypeError, "numbers, the summaries of real trajectories, got 'x'"),
         ({"observed": []}, ValueError, r"trajectories, shape \(L,\) or \(n, L\), got \(0,\)"),
         ({"prior": torch.distributions.Normal(0.0, 1.0)}, TypeError, "named param.*got 'Normal'"),
         ({"prior_share": 7}, ValueError, "prior_share to be a probability, 0 to 1, got 7"),

@@ -151,7 +151,7 @@ def test_python_alone_will_do():
         (("{elbow: q2, shoulder: q1}", "{}"), "at least one joint's position"),
         (("elbow: q2", "elbow: q1"), "each column once, got 'q1'"),
         (("{q1: 1e-3}", "{q3: 1e-3}"), "a channel in noise, got 'q3'"),
-        (("{q1: 1e-3}", "{q1: -1}"), "a standard deviation of q1"),
+        (("{q1: 1e-3}", "{q1: -1}"), "standard deviation of q1"),
         (("[0.5, 2]", "[2, 0.5]"), "low < high"),
         (("[0.5, 2]", "[0.5]"), "2 numbers under"),
         (("log: true", "log: maybe"), "true or false"),

@@ -20,8 +20,11 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from ..counts import check_count
 from ..errors import SimulationError, message
+from ..kinds import check_choice, check_keys, check_kind
 from ..randomness import isolated
+from ..scalars import check_number
 from .actor_critic_losses import BoundedDDPGLoss, BoundedTD3Loss, SoftUpdateAtOnce
 from .goal_networks import GOAL_KEYS, Actor, Critic, GoalState, action_bounds, goal_policy
 from .hindsight import GoalReward, HindsightReplayBuffer
@@ -71,7 +74,8 @@ class DDPG:
     Raises:
         ValueError: A goal key is not observed, the replay buffer is smaller than one batch, or
             there is no such algorithm.
-        TypeError: The actions are not bounded.
+            A number is out of its bounds.
+        TypeError: The actions are not bounded, or an argument is of another kind.
 
     Example:
         >>> from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
@@ -113,8 +117,21 @@ class DDPG:
             for name, value in locals().items()
             if name not in ("self", "env", "reward")
         }
-        if algorithm not in _LOSSES:
-            raise ValueError(message("an algorithm", algorithm, available=_LOSSES))
+        check_kind("a TorchRL environment", env, EnvBase)
+        check_choice("an algorithm", algorithm, _LOSSES)
+        check_keys("critic_keys", critic_keys)
+        check_kind("widths of hidden layers, a sequence", hidden, tuple, list)
+        for width in hidden:
+            check_count("units of a hidden layer", width)
+        check_count("transitions per batch", batch_size)
+        check_count("transitions of capacity", capacity)
+        shares = {"tau": tau, "decay_from": decay_from, "random_share": random_share}
+        for name, value in {**shares, "gamma": gamma}.items():
+            check_number(name, value, least=0.0, most=1.0)
+        sizes = {"final_learning_rate": final_learning_rate, "action_l2": action_l2, "noise": noise}
+        for name, value in {**sizes, "updates_per_frame": updates_per_frame}.items():
+            check_number(name, value, least=0.0)
+        check_number("learning_rate", learning_rate, above=0.0)
         if capacity < batch_size:
             raise ValueError(
                 message(f"a replay buffer of at least one batch of {batch_size}", capacity)

@@ -22,6 +22,8 @@ from torchrl.data.replay_buffers.her import HERReplayBuffer
 
 from ..counts import check_count
 from ..errors import message
+from ..kinds import check_function
+from ..scalars import check_number
 
 GoalReward = Callable[[Tensor, Tensor], Tensor]
 """``(achieved (*, G), desired (*, G)) -> reward (*,)``, the environment's own."""
@@ -51,7 +53,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
             goal's unit; None to relabel any.
 
     Raises:
-        TypeError: ``capacity`` is no whole number.
+        TypeError: ``capacity`` is no whole number, another argument no number or function.
         ValueError: ``share`` is no probability, ``capacity`` not positive, or ``moving`` negative.
 
     Example:
@@ -71,11 +73,11 @@ class HindsightReplayBuffer(HERReplayBuffer):
     def __init__(
         self, reward: GoalReward, *, capacity: int, share: float = 0.8, moving: float | None = 1e-3
     ) -> None:
-        if not 0 <= share <= 1:
-            raise ValueError(message("a share of relabelled transitions in [0, 1]", share))
+        check_number("share of relabelled transitions", share, least=0.0, most=1.0)
         check_count("transitions of capacity", capacity)
-        if moving is not None and moving < 0:
-            raise ValueError(message("a distance that is not negative, or None", moving))
+        check_function("a reward, a function of the achieved and the desired goal", reward)
+        if moving is not None:
+            check_number("distance moved", moving, least=0.0)
         self.capacity, self.moving = capacity, moving
 
         def relabelled(sample: TensorDictBase) -> Tensor:

@@ -10,13 +10,15 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from ..counts import check_count
 from ..effects.catalogue import CATALOGUE, each_once, effect
 from ..effects.effect import Effect
 from ..effects.sensors import SensorDropout
 from ..envs.task import Task
-from ..envs.tasks.catalogue import known_task
+from ..envs.tasks.catalogue import as_task
 from ..errors import message
 from ..inference.priors import BoxPrior
+from ..kinds import check_choice, check_kind
 from ..logs.log import Log
 from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
@@ -66,13 +68,20 @@ def diagnose(
         progress: Told what is done.
 
     Raises:
+        TypeError: The simulator, the prior, a log or an effect is of another kind.
         ValueError: There are no logs, none is long enough, an effect is asked for twice, or there
             is no such mode.
         KeyError: An effect is not in the catalogue.
     """
     begun = time.perf_counter()
-    if mode is not None and mode not in MODES:
-        raise ValueError(message("a mode of the diagnosis", mode, available=list(MODES)))
+    if mode is not None:
+        check_choice("a mode of the diagnosis", mode, MODES)
+    if horizon is not None:
+        check_count("horizon", horizon)
+    check_kind("a sequence of logs", logs, list, tuple)
+    for log in logs:
+        check_kind("a Log, as read_logs gives", log, Log)
+    check_kind("a sequence of findings", findings, list, tuple)
     system = _system(simulator, prior)
     chosen = _effects(system, effects, logs)
     every = units_of(chosen, system.robot)
@@ -148,7 +157,9 @@ def _system(simulator: str | Task | System, prior: BoxPrior | None) -> System:
         if prior is None:
             return simulator
         simulator = simulator.task
-    task = known_task(simulator) if isinstance(simulator, str) else simulator
+    task = as_task(simulator)
+    if prior is not None:
+        check_kind("a BoxPrior or None", prior, BoxPrior)
     physics = None if prior is None else MujocoPhysics(*prior.names)
     return System(task=task, physics=physics, prior=prior)
 

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ..errors import message
+from ..kinds import check_kind
 from . import action, bodies, contacts, disturbance, friction, joints, sensors, transmission
 from .effect import Effect
 
@@ -85,7 +86,11 @@ def each_once(effects: Sequence[str | Effect]) -> None:
 
     Raises:
         ValueError: One is.
+        TypeError: They are no sequence of names and effects.
     """
+    check_kind("a sequence of effects", effects, tuple, list)
+    for one in effects:
+        check_kind("an effect or the name of one", one, str, Effect)
     twice = next((one for one in effects if effects.count(one) > 1), None)
     if twice is not None:
         raise ValueError(message("each effect once", twice))

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..errors import message
+from ..kinds import real_numbers
 
 Strength = float | Tensor | Sequence[float] | Mapping[str, float | Tensor]
 
@@ -35,6 +36,7 @@ def strength_of(name: str, strength: Strength, targets: tuple[str, ...]) -> Tens
     if not targets:
         raise ValueError(message(f"something that {name} can act on", "a robot without"))
     if isinstance(strength, Mapping):
+        strength = dict(strength)
         for target in strength:
             if target not in targets:
                 raise KeyError(message(f"a target of {name}", target, available=targets))
@@ -49,7 +51,7 @@ def strength_of(name: str, strength: Strength, targets: tuple[str, ...]) -> Tens
     else:
         values = _numbers(strength, name)
         values = values.expand(len(targets)) if values.ndim == 0 else values
-    if values.shape[-1] != len(targets):
+    if not values.ndim or values.shape[-1] != len(targets):
         expected = f"one strength of {name} for each of {targets}"
         raise ValueError(message(expected, tuple(values.shape)))
     if not values.isfinite().all():
@@ -59,6 +61,6 @@ def strength_of(name: str, strength: Strength, targets: tuple[str, ...]) -> Tens
 
 def _numbers(value: object, name: str) -> Tensor:
     try:
-        return torch.as_tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
+        return real_numbers(f"strengths of {name} in numbers", value, torch.float64)
+    except TypeError:
         raise ValueError(message(f"strengths of {name} in numbers", value)) from None

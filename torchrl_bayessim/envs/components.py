@@ -21,6 +21,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import message
+from ..kinds import check_keys
 
 _COMPONENTS = (
     "time",
@@ -59,9 +60,13 @@ def finite_rows(name: str, value: ArrayLike, shape: tuple[int, int]) -> NDArray[
         array([[1., 2.]])
 
     Raises:
-        ValueError: ``value`` has not this shape (nothing is broadcast), or is not finite.
+        ValueError: ``value`` has not this shape (nothing is broadcast), or is not finite numbers.
     """
-    array = np.asarray(value, dtype=np.float64)
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, RuntimeError):  # NumPy's and torch's, of what are no numbers
+        expected = f"finite numbers of shape {shape} for {name}"
+        raise ValueError(message(expected, type(value).__name__)) from None
     if array.shape != shape or not np.isfinite(array).all():
         got = "others" if array.shape == shape else array.shape
         raise ValueError(message(f"finite numbers of shape {shape} for {name}", got))
@@ -80,7 +85,10 @@ def chosen_rows(mask: ArrayLike | None, count: int) -> NDArray[np.int64]:
     """
     if mask is None:
         return np.arange(count)
-    array = np.asarray(mask)
+    try:
+        array = np.asarray(mask)
+    except (TypeError, ValueError, RuntimeError):
+        array = np.asarray(None)
     if array.shape != (count,) or array.dtype != bool:
         expected = f"a boolean mask of shape ({count},)"
         raise ValueError(message(expected, f"{array.dtype} of shape {array.shape}"))
@@ -109,7 +117,7 @@ def check_settings(dtype: torch.dtype, seed: object) -> None:
     Raises:
         ValueError: ``dtype`` is not floating, or ``seed`` no integer.
     """
-    if not dtype.is_floating_point:
+    if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
         expected = "a floating dtype, of observations and rewards"
         raise ValueError(message(expected, dtype, available=["torch.float32", "torch.float64"]))
     if seed is not None and not isinstance(seed, int | np.integer):
@@ -135,8 +143,7 @@ def names_of(outputs: Iterable[str]) -> tuple[str, ...]:
     """Return names as a tuple.
 
     Raises:
-        TypeError: ``outputs`` is one string, whose letters are no names.
+        TypeError: ``outputs`` is no sequence of names, or one string, whose letters are none.
     """
-    if isinstance(outputs, str):
-        raise TypeError(message("a tuple of names of outputs", outputs, hint=f"({outputs!r},)"))
+    check_keys("outputs", outputs)
     return tuple(outputs)

@@ -18,6 +18,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ..errors import message
+from ..kinds import check_kind, real_numbers
 from .additions import Addition, rollout_with
 from .components import check_counts, check_own, check_settings, chosen_rows, finite_rows
 from .draws import Draws
@@ -67,6 +68,8 @@ class BatchedMujocoEnv(EnvBase):
         max_steps: int | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
+        if num_envs is None:  # for which there is no default
+            raise ValueError(message("num_envs to be a positive integer", num_envs))
         check_counts(num_envs=num_envs, max_steps=max_steps, threads=threads)
         check_settings(dtype, seed)
         super().__init__(batch_size=torch.Size([int(num_envs)]))
@@ -82,7 +85,7 @@ class BatchedMujocoEnv(EnvBase):
             threads=threads,
         )
         self._additions: dict[object, Addition] = {}
-        self._seed = int(seed)
+        self._seed = 0 if seed is None else int(seed)
         self._episodes = np.zeros(num_envs, dtype=np.int64)
         self._elapsed = torch.zeros(num_envs, 1, dtype=torch.int64)
         self._extras: dict[str, Tensor] = {}
@@ -123,8 +126,10 @@ class BatchedMujocoEnv(EnvBase):
 
         Raises:
             KeyError: There is no such component.
+            TypeError: They are not given by name.
             ValueError: A component or the mask has another shape, or is not finite.
         """
+        check_kind("components of the state by name", components, Mapping, TensorDictBase)
         sizes = {name: self.stepper[name].shape[1] for name in self.stepper.components}
         sizes |= {name: value.shape[1] for name, value in self._extras.items()}
         given = {}
@@ -160,8 +165,10 @@ class BatchedMujocoEnv(EnvBase):
 
         Raises:
             ValueError: The shape is another, or an action is not finite.
+            TypeError: They are no numbers.
         """
-        actions, size = torch.as_tensor(actions), self.action_spec.shape[-1]
+        actions = real_numbers("actions of shape (N, T, A), numbers", actions)
+        size = self.action_spec.shape[-1]
         if actions.ndim != 3 or actions.shape != (self.num_envs, actions.shape[1] or 1, size):
             expected = f"actions of shape ({self.num_envs}, T, {size}), T at least 1"
             raise ValueError(message(expected, tuple(actions.shape)))

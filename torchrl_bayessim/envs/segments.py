@@ -6,22 +6,33 @@ __all__ = ["checked_actions", "copies", "substeps_of", "vectors"]
 
 import math
 from collections.abc import Mapping
+from numbers import Real
 
-import torch
 from numpy.typing import ArrayLike
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from ..errors import message
+from ..kinds import check_kind, real_numbers
 from .task import Task
 
 
 def copies(segments: Mapping[str, ArrayLike]) -> dict[str, Tensor]:
-    """Return the components as tensors of our own: states in double, actions in their precision."""
+    """Return the components as tensors of our own: states in double, actions in their precision.
+
+    Raises:
+        TypeError: They are not given by name, or are no numbers.
+    """
+    check_kind("segments by component, a mapping", segments, Mapping, TensorDictBase)
     names = segments.keys()  # a tensordict's iterator goes through its rows
-    given = {name: torch.as_tensor(segments[name]).detach().clone() for name in names}
+    given = {name: _numbers(name, segments[name]).detach().clone() for name in names}
     return {
         k: v if k == "action" and v.is_floating_point() else v.double() for k, v in given.items()
     }
+
+
+def _numbers(name: str, value: ArrayLike) -> Tensor:
+    return real_numbers(f"numbers in {name!r}", value)
 
 
 def checked_actions(given: Mapping[str, Tensor], task: Task) -> Tensor:
@@ -52,8 +63,11 @@ def substeps_of(task: Task, dt: float) -> int:
     """Return how many time steps of the model are ``dt`` seconds.
 
     Raises:
+        TypeError: ``dt`` is no number.
         ValueError: ``dt`` is not a multiple of the time step, at least one.
     """
+    if not isinstance(dt, Real):
+        raise TypeError(message("dt in seconds", dt))
     timestep = task.model.opt.timestep
     count = round(dt / timestep) if math.isfinite(dt) else 0
     if count < 1 or not abs(count * timestep - dt) <= 1e-6 * dt:
@@ -74,7 +88,7 @@ def vectors(theta: ArrayLike, names: tuple[str, ...]) -> Tensor:
         ValueError: The shape is another, or a number is not finite: what NaN means is the adapter's
             affair, and in a fit it is a mistake.
     """
-    values = torch.as_tensor(theta).detach().cpu()
+    values = real_numbers(f"parameter vectors of {names}", theta).detach().cpu()
     if values.ndim != 2 or values.shape != (len(values) or 1, len(names)):
         expected = f"theta of shape (P, {len(names)}), P at least 1, for the parameters {names}"
         hint = "theta[None] for a single vector" if values.shape == (len(names),) else ""

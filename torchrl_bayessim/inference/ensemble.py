@@ -19,6 +19,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ..errors import message
+from ..kinds import check_kind, real_numbers
 from .fit import FitReport, fit, usable_pairs
 from .physics_posterior import PhysicsPosterior
 from .posterior import MixtureDensityPosterior
@@ -70,9 +71,15 @@ def pairs_of(theta: Tensor, summary: Tensor) -> TensorDict:
         >>> pairs_of(torch.zeros(3, 2), torch.zeros(3, 5)).batch_size
         torch.Size([3])
     """
+    check_kind("parameters of shape (N, D), a tensor", theta, Tensor)
+    if theta.ndim != 2 or theta.is_complex():
+        got = f"{theta.dtype} of shape {tuple(theta.shape)}"
+        raise ValueError(message("real parameters of shape (N, D)", got))
     got = tuple(summary.shape) if isinstance(summary, Tensor) else type(summary).__name__
     if not isinstance(got, tuple) or len(got) != 2 or got[0] != len(theta):
         raise ValueError(message(f"one summary per simulation, shape ({len(theta)}, L)", got))
+    if summary.is_complex():
+        raise TypeError(message("statistics that are real numbers", str(summary.dtype)))
     # counts are statistics too
     summary = summary.detach() if summary.is_floating_point() else summary.to(theta.dtype)
     return TensorDict({"theta": theta, "summary": summary}, batch_size=[len(theta)])
@@ -89,11 +96,7 @@ def real_summaries(observed: Any) -> Tensor:
         >>> real_summaries([[0.25, 1.0]])
         tensor([[0.2500, 1.0000]])
     """
-    try:
-        observed = torch.as_tensor(observed).detach()
-    except (TypeError, ValueError, RuntimeError):
-        got = type(observed).__name__
-        raise TypeError(message("numbers, the summaries of real trajectories", got)) from None
+    observed = real_numbers("numbers, the summaries of real trajectories", observed).detach()
     if observed.ndim not in {1, 2} or not observed.numel():
         expected = "summaries of the real trajectories, shape (L,) or (n, L)"
         raise ValueError(message(expected, tuple(observed.shape)))

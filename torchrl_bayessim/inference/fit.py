@@ -7,7 +7,7 @@ __all__ = ["FitReport", "check_fit_options", "fit", "select_lengthscale", "usabl
 import copy
 import inspect
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..counts import check_count
 from ..errors import SimulationError, message
+from ..kinds import check_choice, check_kind
 from ..randomness import generator
 from ..scalars import check_number
 from .descent import descend
@@ -186,21 +187,26 @@ def fit(
     return FitReport(len(rows), dropped, len(trace[0]), *trace)
 
 
-def check_fit_options(options: Iterable[str]) -> None:
+def check_fit_options(options: Collection[str]) -> None:
     """Refuse names that :func:`fit` has no option of.
 
     Raises:
         ValueError: There is one.
+        TypeError: They are no mapping.
     """
+    check_kind("options of fit by name", options, Mapping, Sequence)
     known = [p.name for p in inspect.signature(fit).parameters.values() if p.kind == p.KEYWORD_ONLY]
-    for name in options:
-        if name not in known:
-            raise ValueError(message("an option of fit", name, available=known))
+    for name in dict(options) if isinstance(options, Mapping) else options:
+        check_choice("an option of fit", name, known)
 
 
 def _in_floats(data: TensorDictBase, *keys: NestedKey) -> TensorDictBase:
     """Return pairs of batch size ``(N,)``, as floats of which no gradient is asked."""
     data = data.copy() if data.ndim == 1 else data.reshape(-1)
+    for key in keys:
+        value = data.get(key, None)
+        if value is not None and not isinstance(value, Tensor):
+            raise TypeError(message(f"a tensor in {key!r}", type(value).__name__))
     if any(value.requires_grad for value in data.values(include_nested=True, leaves_only=True)):
         data = data.detach()
     for key in keys:
@@ -267,6 +273,8 @@ def _weighted(pairs: Rows) -> Rows:
         return pairs
     given = torch.cat([part.get("weight") for part in pairs.parts()])
     weight = one_each("weight", given, pairs.index.shape)
+    if weight.is_complex():
+        raise TypeError(message("weights that are real numbers", str(weight.dtype)))
     good = weight.isfinite() & (weight >= 0)
     if not good.all() or not weight.any():
         text = f"{int((~good).sum())} that are not, sum {weight.sum().item():.3g}"

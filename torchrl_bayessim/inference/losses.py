@@ -22,6 +22,7 @@ from torch import Tensor
 from torchrl.objectives.common import LossModule
 
 from ..errors import message
+from ..kinds import check_choice
 from .priors import Prior
 
 
@@ -73,8 +74,7 @@ class PosteriorLoss(LossModule):
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
         super().__init__()
-        if reduction not in {"mean", "sum", "none"}:
-            raise ValueError(message("a reduction", reduction, available=["mean", "sum", "none"]))
+        check_choice("a reduction", reduction, ["mean", "sum", "none"])
         if not callable(getattr(posterior_network, "get_dist", None)):
             expected = "a posterior network with get_dist, such as a MixtureDensityPosterior"
             raise TypeError(message(expected, type(posterior_network).__name__))

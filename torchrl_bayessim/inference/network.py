@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ..counts import check_count
 from ..errors import message
+from ..kinds import check_choice
 from .features import Features
 from .input_scaling import InputScaling, input_scaling
 from .mixtures import Mixture
@@ -67,10 +68,7 @@ class MixtureDensityNetwork(nn.Module):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        if covariance not in {"diagonal", "full"}:
-            raise ValueError(
-                message("a covariance structure", covariance, available=["diagonal", "full"])
-            )
+        check_choice("a covariance structure", covariance, ["diagonal", "full"])
         check_count("components", components)
         self.features = features
         self.parameters_, self.components, self.covariance = parameters, components, covariance

@@ -30,6 +30,7 @@ from torch import Tensor
 
 from ..counts import check_count
 from ..errors import message
+from ..kinds import check_choice, check_kind, real_numbers
 from .features import Features, FourierFeatures, NeuralFeatures
 from .misspecification import doubts
 from .mixtures import Mixture
@@ -101,8 +102,8 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
     ) -> None:
         check_prior(prior)
         check_count("summary_dim", summary_dim)
-        if isinstance(features, str) and features not in MAPS:
-            raise ValueError(message("the name of a feature map", features, available=MAPS))
+        if not isinstance(features, Features):
+            check_choice("the name of a feature map", features, MAPS)
         if isinstance(features, Features) and features.dim != summary_dim:
             expected = f"features of summaries of size {summary_dim}"
             raise ValueError(message(expected, f"of size {features.dim}", hint="summary_dim"))
@@ -158,12 +159,13 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
             >>> posterior.network.components, posterior.network.covariance
             (10, 'diagonal')
         """
+        check_prior(prior)
+        check_count("summary_dim", summary_dim)
         maps = {
             "fourier": lambda: FourierFeatures(summary_dim, frequencies=500, seed=seed),
             "neural": lambda: NeuralFeatures(summary_dim, widths=(24, 24), seed=seed),
         }
-        if features not in maps:
-            raise ValueError(message("the name of a feature map", features, available=maps))
+        check_choice("the name of a feature map", features, maps)
         return cls(
             prior,
             summary_dim,
@@ -181,6 +183,9 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
 
     def distribution(self, summary: Tensor) -> PhysicsPosterior:
         """Return one posterior per summary, for summaries ``(*, L)``."""
+        check_kind("summaries of shape (*, L), a tensor", summary, Tensor)
+        if not summary.is_floating_point():
+            raise TypeError(message("summaries of floats", str(summary.dtype)))
         return _distribution(
             **self.network(summary)._asdict(),
             prior=self.prior,
@@ -209,11 +214,9 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
             ValueError: For no summaries, wrong shapes, NaN or infinite statistics.
         """
         size = len(self.network.shift)
-        try:
-            given = torch.as_tensor(summaries)
-        except (TypeError, ValueError, RuntimeError):  # torch's, of what it cannot make sense of
-            expected = f"summaries of n >= 1 real trajectories, numbers of shape (n, {size})"
-            raise TypeError(message(expected, summaries)) from None
+        expected = f"summaries of n >= 1 real trajectories, numbers of shape (n, {size})"
+        given = real_numbers(expected, summaries)
+        given = given if given.is_floating_point() else given.to(torch.get_default_dtype())
         summaries = torch.atleast_2d(given.to(self.network.shift.device))
         if summaries.shape != (len(summaries), size) or len(summaries) == 0:
             raise ValueError(
@@ -232,8 +235,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
             )
         # sums and matrix products round a row differently at another place
         summaries = summaries[sorted(range(len(summaries)), key=summaries.tolist().__getitem__)]
-        if pooling not in {"product", "mean"}:
-            raise ValueError(message("a pooling", pooling, available=["product", "mean"]))
+        check_choice("a pooling", pooling, ["product", "mean"])
         if pooling == "mean":
             summaries = summaries.mean(0, keepdim=True)
         each = self.distribution(summaries).mixture

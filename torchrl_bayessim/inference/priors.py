@@ -16,7 +16,7 @@ from __future__ import annotations
 __all__ = ["BoxPrior", "GaussianPrior", "Prior", "check_prior"]
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from typing import Any, ClassVar
 
 import numpy as np
@@ -30,7 +30,9 @@ from torch.distributions.transforms import (
     Transform,
 )
 
+from ..counts import check_count
 from ..errors import message
+from ..kinds import check_kind, real_numbers
 from .standardization import Standardization
 
 Pairs = Mapping[str, tuple[float, float]] | Sequence[tuple[str, tuple[float, float]]]
@@ -79,9 +81,10 @@ class Prior(Distribution):
     settings: dict[str, list[Any]]
 
     def _name(self, names: Sequence[str], units: Mapping[str, str] | None) -> None:
-        units = units or {}
+        units = {} if units is None else units
         if not isinstance(units, Mapping):
             raise TypeError(message("units= to be {name: unit}", units))
+        units = dict(units)
         unknown = [name for name in units if name not in names]
         if unknown:
             raise ValueError(message("units of declared parameters", unknown[0], available=names))
@@ -92,13 +95,17 @@ class Prior(Distribution):
     def standardize(self, theta: Tensor) -> Tensor:
         """Return the standardised coordinates of parameters, shape ``(*, D)``."""
         self._check_event(theta)
-        return self.standardization._inverse(theta)
+        return self.standardization._inverse(_floats(theta))
 
     def unstandardize(self, z: Tensor) -> Tensor:
         """Return the parameters at standardised coordinates, shape ``(*, D)``."""
-        return self.standardization._call(z)
+        self._check_event(z)
+        return self.standardization._call(_floats(z))
 
     def _check_event(self, theta: Tensor) -> None:
+        check_kind("parameters, a tensor of shape (*, D)", theta, Tensor)
+        if theta.is_complex() or theta.dtype == torch.bool:
+            raise TypeError(message("parameters that are real numbers", str(theta.dtype)))
         if theta.shape[-1:] != self.event_shape:
             raise ValueError(
                 message(
@@ -107,6 +114,18 @@ class Prior(Distribution):
                     tuple(theta.shape),
                 )
             )
+
+
+def _floats(values: Tensor) -> Tensor:
+    return values if values.is_floating_point() else values.to(torch.get_default_dtype())
+
+
+def _shape(sample_shape: Sequence[int]) -> Sequence[int]:
+    """Return the shape of a sample, if it is one."""
+    check_kind("a shape of the sample, a tuple", sample_shape, tuple, list)
+    for size in sample_shape:
+        check_count("draws", size, least=0)
+    return sample_shape
 
 
 def check_prior(prior: object) -> None:
@@ -215,7 +234,7 @@ class BoxPrior(Prior):
         self, sample_shape: Sequence[int] = (), *, generator: torch.Generator | None = None
     ) -> Tensor:
         """Return draws of shape ``(*sample_shape, D)``, from ``generator`` if one is given."""
-        shape = (*sample_shape, *self.event_shape)
+        shape = (*_shape(sample_shape), *self.event_shape)
         unit = torch.rand(shape, generator=generator, dtype=self.low.dtype)
         low, high = self._u(self.low), self._u(self.high)
         u = low + unit * (high - low)
@@ -230,6 +249,10 @@ class BoxPrior(Prior):
             >>> BoxPrior({"mass": (2.0, 6.0)}).within(torch.tensor([1.0]), torch.tensor([3.0]))
             BoxPrior(mass: [2, 3])
         """
+        low, high = (real_numbers("bounds of shape (D,)", bound) for bound in (low, high))
+        if not low.shape == high.shape == self.low.shape:
+            expected = f"bounds of shape {tuple(self.low.shape)}"
+            raise ValueError(message(expected, (tuple(low.shape), tuple(high.shape))))
         low, high = torch.maximum(low, self.low), torch.minimum(high, self.high)
         bounds = zip(self.names, zip(low.tolist(), high.tolist(), strict=True), strict=True)
         return BoxPrior(
@@ -264,7 +287,7 @@ class BoxPrior(Prior):
 def _check_bounds(
     pairs: Sequence[tuple[str, tuple[float, float]]], names: Sequence[str], log: Sequence[str]
 ) -> None:
-    if isinstance(log, str) or not isinstance(log, Iterable):
+    if isinstance(log, str | bytes) or not isinstance(log, Sequence | Set):
         raise TypeError(message("log= to be a list of names", log, hint=f"log=[{str(log)!r}]"))
     for name, (low, high) in pairs:
         if not all(abs(bound) <= _LARGEST for bound in (low, high)):
@@ -377,7 +400,7 @@ class GaussianPrior(Prior):
     ) -> Tensor:
         """Return draws of shape ``(*sample_shape, D)``, from ``generator`` if one is given."""
         return self.unstandardize(
-            torch.randn(*sample_shape, *self.event_shape, generator=generator)
+            torch.randn(*_shape(sample_shape), *self.event_shape, generator=generator)
         )
 
     def contains(self, theta: Tensor) -> Tensor:
@@ -402,7 +425,7 @@ class GaussianPrior(Prior):
 def _correlation_tril(correlation: Tensor | None, size: int) -> Tensor:
     if correlation is None:
         return torch.eye(size, dtype=torch.float64)
-    correlation = torch.as_tensor(correlation, dtype=torch.float64)
+    correlation = real_numbers("a correlation matrix", correlation, torch.float64)
     ones = torch.ones(size, dtype=torch.float64)
     if correlation.shape != (size, size) or not torch.allclose(correlation.diagonal(), ones):
         raise ValueError(

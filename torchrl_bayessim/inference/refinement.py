@@ -21,7 +21,8 @@ from torch import Tensor
 
 from ..counts import check_count
 from ..errors import message
-from ..randomness import seed_from
+from ..kinds import check_function, check_kind
+from ..randomness import check_draw_key, seed_from
 from ..sources import Defensive, check_prior_share, draw
 from .ensemble import PosteriorMaker, learn, pairs_of, real_summaries
 from .fit import FitReport, check_fit_options
@@ -86,11 +87,14 @@ class PosteriorRefinement:
         if not (isinstance(margin, Real) and 0 <= margin < math.inf):
             raise ValueError(message("a finite margin of 0 or more", margin))
         check_prior_share(prior_share)
-        check_fit_options(fit_options or {})
+        check_fit_options({} if fit_options is None else fit_options)
+        if make_posterior is not None:
+            expected = "make_posterior, a function of the prior and the summary's size"
+            check_function(expected, make_posterior)
         self.prior, self.simulations, self.networks = prior, simulations, networks
-        self.make_posterior = make_posterior or MixtureDensityPosterior
+        self.make_posterior = MixtureDensityPosterior if make_posterior is None else make_posterior
         self.margin, self.prior_share, self.seed = margin, prior_share, seed
-        self.fit_options = dict(fit_options or {})
+        self.fit_options = {} if fit_options is None else dict(fit_options)
         self.posterior: PhysicsPosterior | None = None
 
     @property
@@ -124,10 +128,13 @@ class PosteriorRefinement:
             progress: Whether the fits show progress bars, where ``fit_options`` do not say.
 
         Raises:
-            TypeError: ``observed`` is not made of numbers; nothing is simulated then.
+            TypeError: ``observed`` is not made of numbers, ``simulate`` no function or ``key`` no
+                tuple; nothing is simulated then.
             ValueError: ``observed`` is not finite, or of another shape; nor then.
         """
         observed = real_summaries(observed)
+        check_draw_key(key)
+        check_function("simulate, a function of parameters (N, D)", simulate)
         theta = draw(self.proposal(), self.simulations, key=(self.seed, *key, "theta"))
         return self.learn(theta, simulate(theta), observed, key=key, progress=progress)
 
@@ -158,6 +165,7 @@ class PosteriorRefinement:
             progress: Whether the fits show progress bars, where ``fit_options`` do not say.
         """
         observed = real_summaries(observed)
+        check_draw_key(key)
         local, proposal = self._proposal()
         pairs = pairs_of(theta, summary)
         if proposal is not local:
@@ -200,7 +208,20 @@ class PosteriorRefinement:
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from such a state."""
+        """Go on from such a state.
+
+        Raises:
+            TypeError: It is no mapping.
+            ValueError: It is of another kind of prior, or not whole.
+        """
+        check_kind("the state of a refinement", state, Mapping)
+        state = dict(state)
+        needed = ["logits", "loc", "scale_tril", "diagonal"]
+        needed += ["low", "high"] if isinstance(self.prior, BoxPrior) else []
+        for name in needed if state else ():
+            if name not in state:
+                expected = f"the state of a refinement under {self.prior!r}, with {name!r}"
+                raise ValueError(message(expected, sorted(map(str, state))))
         if not state:
             self.posterior = None
             return

@@ -18,7 +18,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ..counts import check_count
-from ..errors import SimulationError, message
+from ..errors import SimulationError
+from ..kinds import check_choice, check_function
 from ..randomness import seed_from
 from ..sources import Defensive, check_prior_share, draw
 from .ensemble import learn, pairs_of, real_summaries
@@ -98,7 +99,8 @@ def sequential(
 
     Raises:
         TypeError: On the first turn, for counts that are no whole numbers, a prior that is none of
-            :mod:`.priors`, or ``observed`` that is not made of numbers.
+            :mod:`.priors`, a simulator that is no function, or ``observed`` that is not made of
+            numbers.
         ValueError: On the first turn, for an unknown correction or option, counts that are too
             small, a share that is no probability, ``observed`` that is not finite, or a simulator
             that does not give one summary per simulation.
@@ -109,10 +111,10 @@ def sequential(
     check_count("rounds", rounds)
     check_count("simulations", simulations, least=4)
     check_count("networks", networks)
-    if correction not in {"importance", "truncated", "analytic"}:
-        raise ValueError(
-            message("a correction", correction, available=["importance", "truncated", "analytic"])
-        )
+    check_choice("a correction", correction, ["importance", "truncated", "analytic"])
+    check_function("a simulator, a function of parameters (N, D)", simulator)
+    if make_posterior is not None:
+        check_function("make_posterior, a function of the summary's size", make_posterior)
     check_prior(prior)
     check_prior_share(prior_share)
     check_fit_options(fit_options)

@@ -22,9 +22,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from ..counts import check_count
 from ..errors import message
+from ..kinds import check_function, check_kind
 from ..sources import draw
 from .calibration import Calibration, calibrate
+from .ensemble import real_summaries
 from .identifiability import Identifiability, identifiability
 from .misspecification import doubts, strangeness
 from .physics_posterior import PhysicsPosterior
@@ -79,7 +82,8 @@ def trust(
         seed: Same seed, same report.
 
     Raises:
-        ValueError: The network has not been fitted.
+        TypeError: An argument is of another kind, or ``observed`` is no numbers.
+        ValueError: The network has not been fitted, or ``observed`` is not finite.
 
     Example:
         >>> from tensordict import TensorDict
@@ -93,9 +97,15 @@ def trust(
         >>> "nothing about colour" in str(trust(network, torch.tensor([4.0])))
         True
     """
+    check_kind("a MixtureDensityPosterior", network, MixtureDensityPosterior)
+    check_count("simulations", simulations)
+    if simulate is not None:
+        check_function("simulate, a function of parameters (N, D)", simulate)
+    if held_out is not None:
+        check_kind("held-out pairs in a TensorDict", held_out, TensorDictBase)
     if network.seen is None:
         raise ValueError(message("a fitted network", "one that is not", hint="fit(network, pairs)"))
-    rows = torch.atleast_2d(observed)
+    rows = torch.atleast_2d(real_summaries(observed))
     posterior = network.condition(rows, check=False)
     found = doubts(network.seen, rows, posterior)
     pairs = network.held_out if held_out is None else held_out

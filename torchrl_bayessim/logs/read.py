@@ -10,6 +10,7 @@ from pathlib import Path
 from tensordict import TensorDictBase
 
 from ..errors import message
+from ..kinds import check_kind
 from .log import Log
 from .record import Record, record_of
 from .resampling import resample
@@ -29,14 +30,20 @@ def read_records(source: Source, system: System) -> list[Record]:
         system: The robot; its columns say what is read.
 
     Raises:
+        TypeError: The source or the system is of another kind.
         ValueError: There is no log, a file is malformed, or a column is missing.
         ImportError: The format needs a package that is not installed.
     """
+    check_kind("a System", system, System)
     if isinstance(source, TensorDictBase):
         tables = tensordict_tables(source, system)
     elif isinstance(source, str | Path):
         tables = _tables(Path(source), system)
     else:
+        expected = "a folder, a list of files or a TensorDict of logs"
+        check_kind(expected, source, list, tuple)
+        for path in source:
+            check_kind(expected, path, str, Path)
         tables = [_file_table(Path(path), system) for path in source]
     if not tables:
         raise ValueError(message("at least one log", "none"))

@@ -24,7 +24,6 @@ from __future__ import annotations
 
 __all__ = ["System"]
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -37,8 +36,10 @@ from ..effects.robot import Robot, robot_of
 from ..envs.task import Task
 from ..errors import message
 from ..inference.priors import BoxPrior
+from ..kinds import check_kind
 from ..physics.model_fields import resolve
 from ..physics.mujoco import MujocoPhysics
+from ..scalars import check_number
 from .columns import Channel, Columns, channels, default_columns, joint_names
 from .description import Description, read_description
 from .simulators import simulator_task
@@ -70,6 +71,7 @@ class System:
         effects: Names of the effects to consider; ``None`` for all.
 
     Raises:
+        TypeError: A part is of another kind.
         ValueError: The columns or the noise do not fit the model, the prior is over other
             parameters than the physics, an effect is named twice, or the task's actions are not its
             controls.
@@ -84,9 +86,15 @@ class System:
     effects: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
+        check_kind("a task", self.task, Task)
         model = self.task.model
         if self.columns is None:
             object.__setattr__(self, "columns", default_columns(model))
+        check_kind("columns of logs", self.columns, Columns)
+        for part, kind in (self.physics, MujocoPhysics), (self.prior, BoxPrior):
+            if part is not None:
+                check_kind(f"a {kind.__name__} or None", part, kind)
+        check_kind("deviations of noise by channel", self.noise, Mapping)
         self.columns.check(model)
         if self.task.command is not None or self.task.drive.weld is not None:
             expected = "a task whose actions are the controls of its actuators"
@@ -99,19 +107,20 @@ class System:
         for name, value in self.noise.items():
             if name not in known:
                 raise ValueError(message("a channel in noise", name, available=known))
-            if not 0 <= value < math.inf:
-                raise ValueError(message(f"a standard deviation of {name}, 0 or more", value))
-        each_once(self.effects or ())
+            check_number(f"standard deviation of {name}", value, least=0.0)
+        each_once(() if self.effects is None else self.effects)
 
     @classmethod
     def load(cls, path: str | Path) -> System:
         """Return the system that a ``system.yaml`` describes.
 
         Raises:
+            TypeError: The path is none.
             ValueError: The file is not plain YAML, has unknown or missing keys, or says something
                 that does not fit the model.
             PhysicsError: The model has no such parameter.
         """
+        check_kind("the path of a system.yaml", path, str, Path)
         path = Path(path)
         read = read_description(path)
         read.only("simulator", "control_dt", "columns", "parameters", "noise", "effects")

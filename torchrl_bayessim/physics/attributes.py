@@ -33,6 +33,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ..errors import PhysicsError, message
+from ..kinds import check_names
 from .protocol import simulator_of
 
 _UNITS = {
@@ -62,6 +63,8 @@ class AttributePhysics:
             ``m l² / 12`` about it, for each link. By default they stay gymnasium's constants.
 
     Raises:
+        TypeError: A name is no string.
+        ValueError: There is no name, or one twice.
         PhysicsError: The simulator has no such number (environments are checked when wrapped); in a
             write, a mass, length, time or limit of the table above that is not positive.
 
@@ -76,8 +79,7 @@ class AttributePhysics:
     """
 
     def __init__(self, *names: str, coupled: bool = False) -> None:
-        if not names or len(set(names)) != len(names):
-            raise ValueError(message("attribute names, each once", names))
+        check_names("attribute names, each once", names)
         self.names, self.coupled = names, coupled
 
     @property

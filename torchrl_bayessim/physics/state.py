@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ..errors import PhysicsError, message
+from ..kinds import check_key, check_names
 
 
 class StatePhysics:
@@ -24,6 +25,7 @@ class StatePhysics:
         group: Where they are.
 
     Raises:
+        TypeError: A name is no string.
         ValueError: There is no name, or one twice.
         PhysicsError: The environment's reset gives no such entry.
 
@@ -39,8 +41,8 @@ class StatePhysics:
     """
 
     def __init__(self, *names: str, group: str = "params") -> None:
-        if not names or len(set(names)) != len(names):
-            raise ValueError(message("names, each once", names))
+        check_names("names, each once", names)
+        check_key("group", group)
         self.names, self.group = names, group
 
     def write(

@@ -21,6 +21,7 @@ from ..effects.push import Push
 from ..effects.robot import Robot
 from ..effects.strength import Strength, strength_of
 from ..errors import message
+from ..kinds import check_kind
 from ..physics.mujoco_models import models_of
 from ..randomness import generator
 from .resets import resets, simulator
@@ -51,8 +52,8 @@ class ApplyEffect(Transform):
     Raises:
         KeyError: The catalogue has no such effect, or the effect no such target.
         PhysicsError: The environment is not one of MuJoCo's, for effects on forces or the model.
-        TypeError: It is put around a ``SerialEnv`` or ``ParallelEnv``, for the same; or without
-            ``robot``.
+        TypeError: The effect is none, nor a name; it is put around a ``SerialEnv`` or
+            ``ParallelEnv``, for the same; or without ``robot``.
         ValueError: The robot has no target for it, or the strengths do not fit the targets.
 
     Example:
@@ -75,6 +76,7 @@ class ApplyEffect(Transform):
         seed: int = 0,
     ) -> None:
         super().__init__()
+        check_kind("an effect or the name of one", effect, str, Effect)
         self.effect = known_effect(effect) if isinstance(effect, str) else effect
         self.key, self.channels = key, channels
         self._shared: dict[str, Any] = {"robot": robot, "strength": strength, "identity": object()}

@@ -14,6 +14,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform
 
 from ..errors import PhysicsError, message
+from ..kinds import check_key
 from ..physics.protocol import Physics
 from ..physics.state import StatePhysics
 from .resets import resets, simulator, transforms_of
@@ -37,7 +38,7 @@ class ApplyPhysics(Transform):
         PhysicsError: The simulator does not have a parameter, or does not hold what was written; it
             is one of gymnasium's vector environments; or another ApplyPhysics writes ``key``.
         TypeError: It is put around a ``SerialEnv`` or ``ParallelEnv`` and not inside; or
-            ``physics`` is no `Physics`.
+            ``physics`` is no `Physics`, or ``key`` no key.
         ValueError: θ is not finite or has another length than ``physics.names``.
 
     Example:
@@ -56,6 +57,7 @@ class ApplyPhysics(Transform):
             hint = "AttributePhysics(name, ...) or MujocoPhysics(name, ...)"
             expected = "physics with names, write and read"
             raise TypeError(message(expected, type(physics).__name__, hint=hint))
+        check_key("key", key)
         self.physics, self.key = physics, key
         self._written: Tensor | None = None
         self._held: Tensor | None = None  # float32, of the running episodes

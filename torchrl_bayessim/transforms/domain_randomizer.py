@@ -14,8 +14,10 @@ from torch import Tensor
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform
 
+from ..counts import check_count
 from ..episode_draws import EpisodeDraws
 from ..errors import PhysicsError, message
+from ..kinds import check_key, check_keys, real_numbers
 from ..remote_source import PolicyWithSource
 from ..sources import Empirical, Grid, Source, names_of
 from .resets import resets, simulator, transforms_of
@@ -48,7 +50,8 @@ class DomainRandomizer(Transform):
         PhysicsError: No `ApplyPhysics` before it writes ``key``, or for other parameters; another
             randomizer of ``key``; at a reset, workers of a batched environment that nothing tells
             apart.
-        TypeError: The source, now or when assigned, cannot be sampled; ``pool`` is no whole number.
+        TypeError: The source, now or when assigned, cannot be sampled; a count is no whole number,
+            a name no string.
         ValueError: ``pool`` is not positive, or is given with a `Grid`; the source is over other
             parameters.
 
@@ -78,6 +81,12 @@ class DomainRandomizer(Transform):
         pool: int | None = None,
     ) -> None:
         super().__init__()
+        check_key("key", key)
+        if names is not None:
+            check_keys("names", names)
+            names = tuple(names)
+        if first_environment is not None:
+            check_count("first_environment", first_environment, least=0)
         if pool is not None and isinstance(source, Grid):
             raise ValueError(message("a source that samples, to draw a pool from", "a Grid"))
         self.key, self.first_environment, self.pool = key, first_environment, pool
@@ -131,12 +140,14 @@ class DomainRandomizer(Transform):
             ValueError: θ is not finite, or of another length; at a reset, of another batch.
         """
         expected = "numbers to pin, one for each parameter"
-        try:
-            theta = torch.as_tensor(theta, dtype=torch.float32)
-        except (TypeError, ValueError):
-            raise TypeError(message(expected, theta, hint=f"the order {self.names}")) from None
+        theta = real_numbers(expected, theta, torch.float32)
         columns = theta.shape[-1:] if self.names is None else (len(self.names),)
-        if not theta.ndim or theta.shape[-1:] != columns or not theta.isfinite().all():
+        if (
+            not theta.ndim
+            or theta.shape[-1:] != columns
+            or not len(theta)
+            or not theta.isfinite().all()
+        ):
             expected = f"{expected} of {self.names}" if self.names else expected
             raise ValueError(message(f"finite {expected}", theta.tolist()))
         self._shared["pinned"] = theta
