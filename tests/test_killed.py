@@ -50,7 +50,7 @@ def test_runs_that_go_on_wrongly_are_found(modules, tmp_path, broken):
     killed, _ = modules
     script = tmp_path / "adding.py"
     script.write_text(f"BROKEN = {broken}\n{ADDING}")
-    shares = list(killed.spread(4, seed=0))
+    shares = list(killed.spread(4, seed=0, recipe="adding"))
     tally = killed.break_off(killed.Case(script, ()), tmp_path, shares=shares)
     assert tally.kills == 4
     assert tally.ended >= 1
@@ -67,9 +67,15 @@ def test_a_recipe_that_fails_is_no_broken_run(modules, tmp_path):
 
 def test_moments_are_spread_over_the_run(modules):
     killed, _ = modules
-    shares = np.array(list(killed.spread(20, seed=1)))
-    assert (np.sort(shares * 20).astype(int) == np.arange(20)).all()
-    assert list(shares) == list(killed.spread(20, seed=1)) != list(killed.spread(20, seed=2))
+
+    def shares(seed, recipe):
+        return tuple(killed.spread(20, seed=seed, recipe=recipe))
+
+    one = shares(1, "sim2real_ppo")
+    assert (np.sort(np.array(one) * 20).astype(int) == np.arange(20)).all()
+    assert one == shares(1, "sim2real_ppo")
+    assert one != shares(2, "sim2real_ppo")
+    assert not set(one) & set(shares(1, "withheld_effects"))
 
 
 def write(folder, *, weight=1.0, seconds=1.0, nan=float("nan")):

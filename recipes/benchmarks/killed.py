@@ -138,9 +138,12 @@ def compare(folder: Path, expected: dict[str, object], tally: Tally) -> None:
     tally.differing += (*differing(read(folder), expected), *left)
 
 
-def spread(count: int, *, seed: int) -> Iterator[float]:
-    """Yield ``count`` shares, one at random in each stretch of [0, 1), in random order."""
-    rng = np.random.default_rng(seed)
+def spread(count: int, *, seed: int, recipe: str) -> Iterator[float]:
+    """Yield ``count`` shares, one at random in each stretch of [0, 1), in random order.
+
+    Each recipe has its own.
+    """
+    rng = np.random.default_rng([seed, *recipe.encode()])
     yield from (rng.permutation(count) + rng.random(count)) / count
 
 
@@ -149,7 +152,7 @@ def main(*arguments: str) -> None:
     names = [name for name in arguments if "=" not in name]
     given = options([a for a in arguments if "=" in a], optional=["seed"], kills=25, seed=0)
     for name in names or CASES:
-        shares = list(spread(given["kills"], seed=given["seed"]))
+        shares = list(spread(given["kills"], seed=given["seed"], recipe=name))
         with tempfile.TemporaryDirectory() as folder:
             tally = break_off(CASES[name], Path(folder), shares=shares)
         told = {"ended": tally.ended, "in_mid_write": tally.in_mid_write}
