@@ -1,6 +1,7 @@
 """Shared fixtures: every test owns its randomness and leaves the global generators alone."""
 
 import os
+from pathlib import Path
 
 import pytest
 import torch
@@ -17,3 +18,17 @@ def fixed_seed():
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         yield
+
+
+@pytest.fixture
+def same_numbers(monkeypatch):
+    """Return what asserts that two runs of a recipe wrote the same numbers, but times and paths."""
+    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "recipes" / "benchmarks")
+    from written_numbers import differing, read
+
+    def check(one, other):
+        numbers = read(one)
+        assert "result.json" in {name.split("/")[0] for name in numbers}
+        assert differing(numbers, read(other)) == []
+
+    return check

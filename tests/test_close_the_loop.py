@@ -45,6 +45,11 @@ def finished(run, tmp_path_factory):
     return folder
 
 
+def test_the_same_seed_gives_the_same_numbers(finished, run, same_numbers, tmp_path):
+    run(*SHORT, f"out={tmp_path / 'again'}")
+    same_numbers(tmp_path / "again", finished)
+
+
 def test_the_effect_is_named_and_becomes_one_more_parameter(finished):
     result = json.loads((finished / "result.json").read_text())
     assert [told["verdict"] for told in result["diagnoses"]] == ["named", "named"]

@@ -10,6 +10,7 @@ import torch
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 TINY = ["task=fetch_reach", "short=true", "progress=false", "rounds=1", "simulations=8"]
+LEARNER = ["critic_sees_physics=true", "algorithm=td3"]
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +37,13 @@ def run(recipes):
 @pytest.fixture(scope="module")
 def finished(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("fetch")
-    run(*TINY, "critic_sees_physics=true", "algorithm=td3", f"out={folder}")
+    run(*TINY, *LEARNER, f"out={folder}")
     return folder
+
+
+def test_the_same_seed_gives_the_same_numbers(finished, run, same_numbers, tmp_path):
+    run(*TINY, *LEARNER, f"out={tmp_path / 'again'}")
+    same_numbers(tmp_path / "again", finished)
 
 
 def test_the_result_has_what_others_read(finished):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -66,13 +67,18 @@ def test_table_and_picture_are_there(finished):
     assert (folder / "run/pendulum.png").stat().st_size > 5000
 
 
-def test_finished_parts_are_not_run_again(finished):
-    folder, _ = finished
-    parts = sorted((folder / "run/parts").iterdir())
-    before = [path.stat().st_mtime_ns for path in parts]
-    status, _, err = run("short=true", "problem=pendulum", "out=run", folder=folder)
+def test_a_missing_part_is_run_again_to_the_same_numbers_and_no_other(
+    finished, same_numbers, tmp_path
+):
+    shutil.copytree(finished[0] / "run", tmp_path / "run")
+    missing, *others = sorted((tmp_path / "run/parts").iterdir())
+    before = [path.stat().st_mtime_ns for path in others]
+    missing.unlink()
+    status, _, err = run("short=true", "problem=pendulum", "out=run", folder=tmp_path)
     assert status == 0, err
-    assert [path.stat().st_mtime_ns for path in parts] == before
+    assert others
+    assert [path.stat().st_mtime_ns for path in others] == before
+    same_numbers(tmp_path / "run", finished[0] / "run")
 
 
 def test_an_unknown_problem_ends_in_one_line(tmp_path):

@@ -102,12 +102,34 @@ def test_killed_in_mid_run_it_resumes_to_the_same_files(finished, tmp_path, monk
     from written_numbers import differing, read
 
     folder, _ = finished
-    case, broken = Case(RECIPE, TINY), tmp_path / "run"
+    case, broken = Case(RECIPE, TINY), tmp_path / "run"  # a whole second run in two parts
     assert not run(case, broken, until=(broken / "rounds.json").exists)  # in the second round
     assert read(broken)["checkpoint.pt/loop/round"] < 2  # and every file is whole
     assert not (broken / "result.json").exists()
     assert run(case, broken)
     assert differing(read(broken), read(folder)) == []
+
+
+def test_seeds_are_compared_to_the_same_numbers(finished, same_numbers, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(RECIPE.parent)
+    import recipe
+    import sim2real_seeds
+
+    result = json.loads((finished[0] / "result.json").read_text())
+    for name in ("one", "again"):
+        for seed in range(2):  # runs that are done; what one of them does is tested above
+            folder = tmp_path / name / f"seed{seed}"
+            folder.mkdir(parents=True)
+            result["rounds"][1]["real_return"] += seed
+            (folder / "result.json").write_text(json.dumps(result))
+            result["rounds"][1]["real_return"] -= seed
+        arguments = ["sim2real_seeds.py", "short=true", "seeds=2", f"out={tmp_path / name}"]
+        monkeypatch.setattr(sys, "argv", arguments)
+        recipe.main(sim2real_seeds.Seeds, sim2real_seeds.job)
+    same_numbers(tmp_path / "again", tmp_path / "one")
+    told = json.loads((tmp_path / "one/result.json").read_text())
+    gain = result["gain"]["real_return"] + 0.5
+    assert told["gain"]["mean"] == pytest.approx(gain)
 
 
 @pytest.mark.parametrize(

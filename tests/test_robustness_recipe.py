@@ -8,6 +8,7 @@ import pytest
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 TINY = ["short=true", "progress=false", "seeds=2", "points=3"]
+SOURCES = ["task=fetch_reach", "sources=prior,posterior,oracle"]
 
 
 @pytest.fixture(scope="module")
@@ -28,8 +29,13 @@ def run():
 @pytest.fixture(scope="module")
 def finished(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("robustness")
-    run(*TINY, "task=fetch_reach", "sources=prior,posterior,oracle", f"out={folder}")
+    run(*TINY, *SOURCES, f"out={folder}")
     return folder
+
+
+def test_the_same_seed_gives_the_same_numbers(finished, run, same_numbers, tmp_path):
+    run(*TINY, *SOURCES, f"out={tmp_path / 'again'}")
+    same_numbers(tmp_path / "again", finished)
 
 
 def test_curves_and_paired_differences_are_there(finished):

@@ -5,6 +5,7 @@ import hashlib
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -554,14 +555,31 @@ def test_bad_settings_are_explained(tmp_path, monkeypatch, capsys):
         assert said in capsys.readouterr().err
 
 
-def test_it_seals_diagnoses_and_scores(tmp_path):
-    command = [sys.executable, str(RECIPES / "withheld_effects.py"), "robots=arm"]
-    command += ["tiers=T0=1,T1=1", "progress=false", "out=run", "seed=5"]
+SHORT = ["robots=arm", "tiers=T0=1,T1=1", "progress=false", "seed=5"]
+
+
+def test_it_seals_diagnoses_and_scores_and_does_so_again(
+    tmp_path, same_numbers, monkeypatch, capsys
+):
+    command = [sys.executable, str(RECIPES / "withheld_effects.py"), *SHORT, "out=run"]
     environment = os.environ | {"PYTHONWARNINGS": "ignore"}
     done = subprocess.run(
         command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+    import recipe
+    import withheld_effects
+
+    again = tmp_path / "again"
+    again.mkdir()
+    kept = json.loads((tmp_path / "run/sealed/labels.json").read_text())
+    (kept,) = (name for name, label in kept.items() if label["tier"] == "T0")
+    (again / "reports").mkdir()  # all is done again but one diagnosis, to save its time
+    shutil.copy(tmp_path / f"run/reports/{kept}.json", again / "reports")
+    monkeypatch.setattr(sys, "argv", ["withheld_effects.py", *SHORT, f"out={again}"])
+    recipe.main(withheld_effects.Withheld, withheld_effects.job)
+    same_numbers(again, tmp_path / "run")
+    assert capsys.readouterr().out.splitlines()[0] == done.stdout.splitlines()[0]
     first, *_, last = done.stdout.splitlines()
     sealed = tmp_path / "run" / "sealed" / "labels.json"
     digest = hashlib.sha256(sealed.read_bytes()).hexdigest()
