@@ -107,6 +107,26 @@ def test_a_flipped_bit_in_a_tensor_is_noticed(file):
         load(file)
 
 
+def test_whatever_byte_is_altered_the_state_is_whole_or_refused_in_words(file):
+    state = {"loop": {"round": 1, "curve": [{"frames": 3.5}]}, "x": torch.arange(8.0)}
+    save(file, state)
+    data, said = file.read_bytes(), []
+    changes = np.random.default_rng(0).integers([[0, 1]], [[len(data), 256]], (600, 2))
+    for place, change in changes.tolist():
+        altered = bytearray(data)
+        altered[place] ^= change
+        file.write_bytes(altered)
+        try:
+            found = load(file)
+        except ValueError as error:
+            said.append(str(error))
+        else:
+            assert str(found) == str(state)
+    assert len(said) > 100
+    known = ("expected a whole checkpoint", "expected a checkpoint written")
+    assert [text for text in said if not text.startswith(known)] == []
+
+
 def test_foreign_files_are_refused(file):
     file.write_text("time,q\n0,1\n")
     with pytest.raises(ValueError, match="whole checkpoint"):
