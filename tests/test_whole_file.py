@@ -58,14 +58,18 @@ def test_what_a_killed_writer_left_is_removed_by_the_next(file):
     (left,) = (path for path in file.parent.iterdir() if path != file)
     assert left.read_bytes() == b"half"
     assert file.read_text() == "old"
-    other = left.with_name(f".other.md.{left.name.rpartition('.table.md.')[2]}")
-    own = left.with_name(f".table.md.{os.getpid()}.tmp")
-    running = left.with_name(f".table.md.{os.getppid()}.tmp")
-    for path in (other, own, running):
-        path.write_text("of another file, or of a writer that runs")
+    writer = left.name.removeprefix(".table.md.").removesuffix(".tmp")
+    machine, _, ended = writer.rpartition(".")
+    assert machine
+    stay = [f".other.md.{writer}", f".table.md.{machine}.{os.getppid()}"]
+    stay += [f".table.md.elsewhere.{ended}", f".table.md.{machine}.5.{writer}"]
+    stay = {left.with_name(f"{name}.tmp") for name in stay}
+    own = left.with_name(f".table.md.{machine}.{os.getpid()}.tmp")
+    for path in (*stay, own):
+        path.write_text("of another file, machine, or of a writer that runs")
     write_text(file, "new")
     assert file.read_text() == "new"
-    assert set(file.parent.iterdir()) == {file, other, running}
+    assert set(file.parent.iterdir()) == {file, *stay}
 
 
 def test_data_are_forced_to_disk_before_the_rename_and_the_folder_after(file, monkeypatch):
@@ -78,6 +82,13 @@ def test_data_are_forced_to_disk_before_the_rename_and_the_folder_after(file, mo
         whole.write(b"new")
         (written,) = file.parent.iterdir()
     assert done == [str(written), str(file.parent)]
+    done.clear()
+    with replacing_folder(file.with_name("pairs")) as beside:
+        (beside / "part").mkdir()
+        (beside / "part" / "rows").write_text("new")
+    inside = {str(beside / name) for name in ("part", "part/rows")}
+    assert set(done[:2]) == inside
+    assert done[2:] == [str(beside), str(file.parent)]
 
 
 def writers(path):

@@ -8,6 +8,7 @@ from __future__ import annotations
 __all__ = ["replacing", "replacing_folder", "write_text"]
 
 import os
+import platform
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,12 +18,16 @@ from typing import BinaryIO
 
 from .errors import message
 
+# On a shared file system others write too, whose processes have numbers of their own
+_MACHINE = platform.node().replace(os.sep, "-") or "unnamed"
+
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Open a file that takes the place of ``path`` when the block ends without an error.
 
-    Missing folders are made. What a writer of the same file left when it was killed is removed.
+    Missing folders are made. What a writer of the same file on this machine left when it was killed
+    is removed.
 
     Args:
         path: The file; replaced if it exists.
@@ -43,7 +48,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     path = Path(path).absolute()
     path.parent.mkdir(parents=True, exist_ok=True)
     _sweep(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = _beside(path)
     try:
         with temporary.open("wb") as file:
             yield file
@@ -77,7 +82,8 @@ def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Make a folder beside ``path`` that becomes it when the block ends without an error.
 
     Args:
-        path: The folder, which must not exist. What is left of a killed writer is removed.
+        path: The folder, which must not exist. What is left of a killed writer on this machine is
+            removed.
 
     Raises:
         FileExistsError: There is such a folder, or file.
@@ -98,17 +104,22 @@ def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise FileExistsError(message("a folder that does not exist yet", str(path), hint=hint))
     path.parent.mkdir(parents=True, exist_ok=True)
     _sweep(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = _beside(path)
     temporary.mkdir()
     try:
         yield temporary
         for file in temporary.rglob("*"):
-            if file.is_file():
-                _sync(file)
+            (_sync_folder if file.is_dir() else _sync)(file)
+        _sync_folder(temporary)
         temporary.rename(path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     _sync_folder(path.parent)
+
+
+def _beside(path: Path) -> Path:
+    """Return where this process writes what is to become ``path``."""
+    return path.with_name(f".{path.name}.{_MACHINE}.{os.getpid()}.tmp")
 
 
 def _sync(file: Path) -> None:
@@ -118,26 +129,26 @@ def _sync(file: Path) -> None:
 
 
 def _sweep(path: Path) -> None:
-    """Remove what killed writers of ``path`` left beside it."""
-    for left in path.parent.glob(f".{escape(path.name)}.*.tmp"):
+    """Remove what killed writers of ``path`` on this machine left beside it."""
+    for left in path.parent.glob(f".{escape(path.name)}.{escape(_MACHINE)}.*.tmp"):
         writer = left.name.removesuffix(".tmp").rpartition(".")[2]
-        if writer.isdecimal() and not _alive(int(writer)):
+        if left.name == f".{path.name}.{_MACHINE}.{writer}.tmp" and _ended(writer):
             if left.is_dir():
                 shutil.rmtree(left)
             else:
                 left.unlink(missing_ok=True)
 
 
-def _alive(process: int) -> bool:
-    if os.name != "posix":  # elsewhere signal 0 is not a question
-        return True
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
+def _ended(process: str) -> bool:
+    if os.name != "posix" or not process.isdecimal():  # elsewhere signal 0 is not a question
         return False
-    except (PermissionError, OverflowError):
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
         return True
-    return True
+    except (PermissionError, OverflowError):
+        return False
+    return False
 
 
 def _sync_folder(folder: Path) -> None:
