@@ -236,6 +236,21 @@ def test_what_a_worker_raises_is_raised_here(collectors):
         pairs(SummaryStatistics(wrong), collectors=collectors)
 
 
+class Unsendable(Exception):  # noqa: N818
+    """An error that no process can read from another."""
+
+    def __init__(self, one, two):
+        super().__init__(f"{one} and {two}")
+
+
+def test_an_error_that_cannot_be_sent_is_told(collectors):
+    def wrong(state, action, following, mask):
+        raise Unsendable("this", "that")
+
+    with pytest.raises(SimulationError, match=r"workers without errors, got '.*this and that"):
+        pairs(SummaryStatistics(wrong), collectors=collectors)
+
+
 def test_a_worker_that_always_dies_ends_the_run(cluster, tmp_path):
     mortal = {"max_restarts": 1, "max_task_retries": 1, "num_cpus": 0}
     policy = learner().policy
@@ -260,6 +275,16 @@ def test_what_cannot_be_done_is_refused(cluster, collectors):
         RayCollectors(make, policy, environments=6, steps=3, workers=4)
     with pytest.raises(ValueError, match="a cluster with 6 processors for the workers, got '2'"):
         RayCollectors(make, policy, environments=6, steps=3, workers=6)
+    for wrong, error, said in (
+        ({"workers": 2.0}, TypeError, r"a whole number of workers, got 2\.0"),
+        ({"workers": 0}, ValueError, "workers to be positive, got 0"),
+        ({"environments": None}, TypeError, "a whole number of environments, got None"),
+        ({"make": None}, TypeError, "make, a function of the number of environments"),
+        ({"policy": "random"}, TypeError, "a policy, a TensorDictModule, got 'str'"),
+    ):
+        given = {"make": make, "policy": policy, "environments": 6, "steps": 3} | wrong
+        with pytest.raises(error, match=said):
+            RayCollectors(given.pop("make"), given.pop("policy"), **given)
     randomizer = DomainRandomizer(PRIOR)
     with pytest.raises(ValueError, match="6 environments of 10 steps, as on Ray, got '4 of 10'"):
         simulate(
@@ -271,6 +296,18 @@ def test_what_cannot_be_done_is_refused(cluster, collectors):
             max_steps=3,
             collectors=collectors,
         )
+
+
+def test_an_environment_with_other_physics_is_refused(collectors):
+    randomizer = DomainRandomizer(BoxPrior({"masspole": (0.1, 1.0)}))
+    physics = ApplyPhysics(AttributePhysics("masspole"))
+    other = TransformedEnv(CartPoleEnv(N), Compose(physics, randomizer, StepCounter(50)))
+    asked = {"pairs": 4, "max_steps": STEPS, "collectors": collectors}
+    with pytest.raises(ValueError, match=r"as make\(\) gives on Ray, with columns of 'episode_r"):
+        simulate(other, None, SummaryStatistics(moments), randomizer, **asked)
+    whole = TransformedEnv(other, RewardSum())
+    with pytest.raises(ValueError, match=r"with parameters in 'theta': length, got 'masspole'"):
+        simulate(whole, None, SummaryStatistics(moments), randomizer, **asked)
 
 
 def test_without_ray_its_extra_is_named(monkeypatch):

@@ -25,10 +25,12 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from .counts import check_count
 from .diverged import UndisturbedPolicy
 from .errors import SimulationError, message
+from .kinds import check_function, check_kind
 from .pairs import counted
-from .ray_worker import Block, Inference, RayWorker
+from .ray_worker import Block, Inference, RayWorker, described
 from .summaries import SummaryStatistics
 from .trajectories import concatenate, first_trajectories
 from .transforms.domain_randomizer import DomainRandomizer
@@ -57,8 +59,9 @@ class RayCollectors:
 
     Raises:
         ImportError: Ray is not installed.
-        ValueError: W does not divide N, the cluster has too few processors, or an environment has
-            no randomizer.
+        TypeError: A number is no whole number, ``make`` no function or the policy none.
+        ValueError: A number is not positive, W does not divide N, the cluster has too few
+            processors, or an environment has no randomizer.
         SimulationError: A worker cannot begin or, in a call, died too often. What a worker raises
             is raised here.
 
@@ -83,12 +86,18 @@ class RayCollectors:
         if find_spec("ray") is None:
             hint = 'pip install "torchrl_bayessim[ray]"'
             raise ImportError(message("the package ray", "none", hint=hint))
-        if workers < 1 or environments % workers:
+        for name, value in {"environments": environments, "steps": steps}.items():
+            check_count(name, value)
+        check_count("workers", workers)
+        check_function("make, a function of the number of environments", make)
+        check_kind("a policy, a TensorDictModule", policy, TensorDictModuleBase)
+        if environments % workers:
             expected = f"a number of workers that divides the {environments} environments"
             raise ValueError(message(expected, workers))
         self.environments, self.steps, self.workers = environments, steps, workers
         needs = _WORKER | (worker or {})
         self._block: tuple[Any, DomainRandomizer] | None = None
+        self._there: dict[str, str] | None = None  # what the workers' environments are
         self._own = not self._ray.is_initialized()
         if self._own:
             self._ray.init(**(_CLUSTER | (cluster or {})))
@@ -190,7 +199,7 @@ class RayCollectors:
         return torch.cat(found), batches
 
     def check(self, env: EnvBase, *, steps: int | None = None) -> None:
-        """Refuse an environment of another size, or training batches of another length.
+        """Refuse an environment of another size, physics or entries, or batches of another length.
 
         Raises:
             ValueError: Pairs and batches would not be those of this environment.
@@ -199,6 +208,14 @@ class RayCollectors:
         if got != (self.environments, self.steps):
             expected = f"{self.environments} environments of {self.steps} steps, as on Ray"
             raise ValueError(message(expected, f"{got[0]} of {got[1]}"))
+        here, there = described(env), self._there or {}
+        if not there:
+            there = self._there = self._ask("described", [()] * self.workers)[0]
+        for name in sorted(here.keys() | there.keys()):
+            asked, made = here.get(name, "nothing"), there.get(name, "nothing")
+            if asked != made:
+                expected = f"an environment as make() gives on Ray, with {name}: {made}"
+                raise ValueError(message(expected, asked, hint="one make() for both"))
 
     def begin(self, randomizer: DomainRandomizer, *, key: tuple[int | str, ...]) -> None:
         """Begin new episodes, with θ from the randomizer's source, for the batches that follow.
@@ -254,6 +271,12 @@ class RayCollectors:
             yield
         except errors.RayTaskError as error:
             raise error.cause from error
+        except errors.UnserializableException as error:
+            lines = str(error).strip().splitlines()
+            hint = "an exception that copy.copy can copy; the whole story is above"
+            raise SimulationError(
+                message("workers without errors", lines[-1], hint=hint)
+            ) from error
         except errors.RayActorError as error:
             lines = str(error).strip().splitlines()
             raise SimulationError(

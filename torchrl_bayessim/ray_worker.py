@@ -6,7 +6,7 @@ asked again, with the same answer.
 
 from __future__ import annotations
 
-__all__ = ["Block", "Inference", "RayWorker"]
+__all__ = ["Block", "Inference", "RayWorker", "described"]
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +23,9 @@ from .errors import message
 from .randomness import isolated, seed_from
 from .simulate import collect_summaries, make_collector, next_batch
 from .summaries import SummaryStatistics
+from .transforms.apply_physics import ApplyPhysics
 from .transforms.domain_randomizer import DomainRandomizer, randomizers
+from .transforms.resets import simulator, transforms_of
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,10 @@ class RayWorker(Collector):
 
     def __repr__(self) -> str:  # which Ray prints before every line of a worker
         return f"{type(self).__name__}({self.number})"
+
+    def described(self) -> dict[str, str]:
+        """Return what this worker simulates: see the function."""
+        return described(self.env)
 
     def summarise(
         self, question: Inference | None, theta: Tensor, first: int, keep: int
@@ -122,6 +128,20 @@ class RayWorker(Collector):
         with isolated(*block.key, "reset", worker):
             self.set_seed(seed_from(*block.key, "env", worker) % 2**31)
             self.reset()
+
+
+def described(env: EnvBase) -> dict[str, str]:
+    """Return what tells an environment from another, whatever its number of simulations.
+
+    Its simulator, the parameters that are written, and the columns of its entries.
+    """
+    found = {"simulator": type(simulator(env)).__name__}
+    for physics in transforms_of(env, ApplyPhysics):
+        found[f"parameters in {physics.key!r}"] = ", ".join(physics.names)
+    for specs in (env.full_observation_spec, env.full_action_spec):
+        for key, spec in specs.items(include_nested=True, leaves_only=True):
+            found[f"columns of {key!r}"] = str(tuple(spec.shape[env.ndim :]))
+    return found
 
 
 def _randomizer(env: EnvBase) -> DomainRandomizer:
