@@ -22,6 +22,7 @@ _OF_MUJOCO = {"load_dependent_friction"}  # which asks MuJoCo for the load
 _OF_GYMNASIUM = {"hopper", "half_cheetah"}
 _OTHER_ONLY = {"backlash", "series_elasticity"}  # of two masses, unlike the catalogue's
 _SAME_ONLY = {"armature", "com_shift"}
+_TOO_FAST = {"half_cheetah": {"backlash"}}  # two masses at 40 Hz, on its grid of 10 ms
 
 
 def applicable(robot: str, form: str = "same") -> list[str]:
@@ -32,6 +33,7 @@ def applicable(robot: str, form: str = "same") -> list[str]:
     left = _OTHER_ONLY if form == "same" else _SAME_ONLY
     if robot == "cart_pole":
         left = left | _OTHER_ONLY | {"armature"}  # its motor has no rotor
+    left = left | _TOO_FAST.get(robot, set())
     return [name for name in names if name not in left]
 
 
