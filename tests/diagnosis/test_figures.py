@@ -81,6 +81,21 @@ def drawn(searched):
     return figures(prepared, selection, measured)
 
 
+def test_figures_are_in_units_of_the_floor(searched):
+    """Covariances that allow for more than there is leave a perfect simulator less than 1."""
+    prepared, selection = searched
+    points = [Point(np.zeros_like(selection.best.fit.point.z)), selection.nominal.fit.point]
+    points.append(selection.best.fit.point)
+    plain, halved = (
+        shrinkage(prepared.sets["test"], points, np.random.default_rng(0), floor=floor)
+        for floor in (1.0, 0.5)
+    )
+    assert halved.refit == pytest.approx(2 * plain.refit)
+    assert halved.effects == pytest.approx(2 * plain.effects)
+    expected = (halved.refit - halved.effects) / (halved.refit - 1.0)
+    assert halved.explained == pytest.approx(expected)
+
+
 def test_they_are_plain_numbers(drawn):
     text = json.dumps(drawn, allow_nan=False)
     assert json.loads(text) == drawn

@@ -68,7 +68,8 @@ def assemble(
         selection = settled(selection, max(credit, key=credit.__getitem__), prepared.sets)
     best, nominal = selection.best, selection.nominal
     zero = Point(np.zeros_like(nominal.fit.point.z))
-    measured = shrinkage(test, [zero, nominal.fit.point, best.fit.point], generator)
+    points = [zero, nominal.fit.point, best.fit.point]
+    measured = shrinkage(test, points, generator, floor=_floor(selection, prepared.sets))
     credit = _credit(selection)
     confused = confusion_set(selection, max(credit, key=credit.__getitem__)) if credit else ()
     alarms = [*prepared.alarms, *(str(f) for f in findings)]
@@ -151,6 +152,20 @@ def assemble(
         strengths=strengths if effects else {},
         figures=figures(prepared, selection, measured),
     )
+
+
+def _floor(selection: Selection, sets: Mapping[str, Objective]) -> float:
+    """Return the mean squared innovation that a perfect simulator leaves, at most 1.
+
+    Known where effects were found: what the best model leaves of the runs that it was found on.
+    """
+    best = selection.best
+    if not best.units:
+        return 1.0
+    parts = (best.fit.innovations, sets["train"]), (best.validation, sets["validation"])
+    left = sum(float((one**2).sum()) for one, _ in parts)
+    size = sum(float((o.whitening.weights**2).sum()) * one.shape[1] for one, o in parts)
+    return min(left / size, 1.0)
 
 
 def _not_excited(selection: Selection, candidates: Sequence[Candidate]) -> list[Unit]:

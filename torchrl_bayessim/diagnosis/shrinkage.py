@@ -47,16 +47,28 @@ class Shrinkage:
 
 
 def shrinkage(
-    test: Objective, points: Sequence[Point], generator: np.random.Generator
+    test: Objective,
+    points: Sequence[Point],
+    generator: np.random.Generator,
+    *,
+    floor: float = 1.0,
 ) -> Shrinkage:
     """Return the figures for three points: prior mean, refit, with effects.
+
+    Args:
+        test: Segments of the test runs.
+        points: The three.
+        generator: Of the bootstrap.
+        floor: Mean squared innovation of a perfect simulator, where it is known to be less than 1:
+            covariances that must allow for chaos, or for velocities that were not measured, allow
+            for more than there is. All figures are in units of it.
 
     Whole trajectories are resampled where there are four of them or more, else segments.
     """
     innovations = test(points)
     weight = test.whitening.weights**2
     per = (innovations**2).sum(-1)
-    size = weight * innovations.shape[2]
+    size = floor * weight * innovations.shape[2]
     groups = test.segments.log
     if len(np.unique(groups)) < 4:
         groups = np.arange(len(per[0]))
