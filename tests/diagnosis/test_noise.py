@@ -1,9 +1,18 @@
 """The noise floor, of innovations that are known."""
 
+import copy
+
+import mujoco
 import numpy as np
 import pytest
+import torch
 
+from torchrl_bayessim.diagnosis.noise import assumed_noise, measured_noise
+from torchrl_bayessim.diagnosis.prediction import Predictor
 from torchrl_bayessim.diagnosis.whitening import innovation_noise
+from torchrl_bayessim.envs.tasks.catalogue import known_task
+from torchrl_bayessim.logs.log import Log
+from torchrl_bayessim.logs.system import System
 
 SEGMENTS, ROWS, CHANNELS = 60, 8, 2
 NONE = np.zeros((0, SEGMENTS, ROWS * CHANNELS))
@@ -53,3 +62,66 @@ def test_a_few_segments_are_not_told_apart():
     uneven = white(0)[:16]
     uneven[::2] *= 3.0
     assert (innovation_noise(uneven, NONE[:, :16], ROWS) > 1.5 * found).all()
+
+
+def cheetah(*, noise=None, stiffness=0.0):
+    """Return HalfCheetah, its logs with a spring at a joint that it does not have, their noise."""
+    task = known_task("HalfCheetah-v5")
+    model, rng, logs = copy.copy(task.model), np.random.default_rng(0), []
+    model.jnt_stiffness[model.joint("bthigh").id] += stiffness
+    true = np.repeat([0.002, 0.02], model.nv)
+    for i in range(4):
+        data, rows, commands = mujoco.MjData(model), [], 0.5 * rng.uniform(-1, 1, (80, model.nu))
+        for u in commands:
+            rows.append(np.r_[data.qpos, data.qvel] + true * rng.standard_normal(2 * model.nv))
+            data.ctrl[:] = u
+            mujoco.mj_step(model, data, task.frame_skip)
+        state = torch.from_numpy(np.array(rows))
+        logs.append(
+            Log(
+                name=f"run{i}",
+                time=task.dt * torch.arange(80).double(),
+                qpos=state[:, : model.nq],
+                qvel=state[:, model.nq :],
+                ctrl=torch.from_numpy(commands),
+                velocity_gain=torch.zeros(model.nv).double(),
+                measured=torch.ones(2 * model.nv, dtype=torch.bool),
+            )
+        )
+    given = {} if noise is None else dict(zip(System(task=task).robot.channels, noise, strict=True))
+    return System(task=task, noise=given), logs, true
+
+
+def test_fast_motion_is_no_noise():
+    """Third differences of a robot that runs at 20 Hz are many times its sensors' noise."""
+    system, logs, true = cheetah()
+    predictor = Predictor(system)
+    assert np.median(assumed_noise(predictor, logs) / true) > 5
+    noise, _ = measured_noise(predictor, logs, history=8, alarms=[])
+    assert np.exp(np.abs(np.log(noise / true)).max()) < 1.6
+
+
+def test_no_sensor_is_much_worse_than_its_like():
+    """What a spring does that the model lacks is no noise of the sensors at its joint."""
+    system, logs, true = cheetah(stiffness=400.0)
+    noise, _ = measured_noise(Predictor(system), logs, history=8, alarms=[])
+    legs = noise.reshape(2, -1)[:, 3:] / true.reshape(2, -1)[:, 3:]
+    usual = np.quantile(legs, 0.25, axis=1)
+    assert (legs[:, 0] > 1.5 * usual).all()
+    assert (legs[:, 0] <= 3.01 * usual).all()
+
+
+def test_no_sensor_is_much_worse_than_its_spec():
+    *_, spec = cheetah()
+    system, logs, _ = cheetah(noise=spec, stiffness=400.0)
+    alarms = []
+    noise, _ = measured_noise(Predictor(system), logs, history=8, alarms=alarms)
+    assert noise.max() <= 3.01 * spec.max()
+    assert any("bthigh velocity" in alarm for alarm in alarms)
+
+
+def test_a_sensor_may_be_twice_as_bad_as_its_spec():
+    *_, true = cheetah()
+    system, logs, _ = cheetah(noise=0.5 * true)
+    noise, _ = measured_noise(Predictor(system), logs, history=8, alarms=[])
+    assert noise == pytest.approx(true, rel=0.5)

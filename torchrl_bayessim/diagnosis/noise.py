@@ -6,17 +6,25 @@ __all__ = ["assumed_noise", "measured_noise"]
 
 from collections.abc import Sequence
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from ..effects.robot import Robot
 from ..logs.log import Log
 from .objective import Objective, Point, origin, parameters_at, pushes_of
 from .prediction import Predictor
 from .refit import refit
-from .segments import cut
-from .whitening import innovation_noise, noise_from_differences, whitening
+from .segments import Segments, cut
+from .whitening import ENOUGH, innovation_noise, noise_from_differences, whitening
 
 Array = NDArray[np.float64]
+_ROUNDS = 8  # third differences of fast motion start a hundred times too high
+_AT_ONCE = 5.0  # the most that a round trusts: too large a noise hides how far it is too large
+_SETTLED = 0.1  # logarithm of a factor that is not worth another round
+_STEPS, _FEWER = 8, 4  # control steps of a segment; where that makes few segments, half of them
+_BEYOND = 3.0  # times its spec, or its like, that a sensor is not noisier than
+_LIKE = 3  # sensors of one kind
 
 
 def assumed_noise(predictor: Predictor, logs: Sequence[Log]) -> Array:
@@ -35,11 +43,10 @@ def measured_noise(
     system, noise = predictor.system, assumed_noise(predictor, logs)
     channels, tiny = system.robot.channels, 1e-6 * system.robot.channel_scale.numpy()
     given = np.array([system.noise.get(name, np.nan) for name in channels])
-    steps = min(8, min(len(log) for log in logs) // 2)
-    pieces = cut(logs, steps, history=history, most=60, burn_in=history)
+    pieces = _pieces(logs, history=history)
     pushes = pushes_of(system.robot)
     z = origin(system.prior)
-    for _ in range(2):
+    for _ in range(_ROUNDS):
         white = whitening(predictor, pieces, parameters_at(system.prior, z), noise)
         objective = Objective(predictor, system.prior, pieces, white)
         fit = refit(objective, [Point(z)], iterations=4)[0]
@@ -47,16 +54,57 @@ def measured_noise(
         points = [Point(z, {unit: 0.1 * unit.high}) for unit in pushes]
         pushed = objective(points) if points else np.zeros((0, *fit.innovations.shape))
         factor = innovation_noise(fit.innovations, pushed - fit.innovations, len(pieces.checked))
-        factor = np.clip(factor, 0.2, 5.0)
-        noise = np.maximum(noise * factor, tiny)
+        noise = np.maximum(noise * np.clip(factor, 1 / _AT_ONCE, _AT_ONCE), tiny)
+        estimate, noise = noise, np.minimum(noise, _most(noise, given, system.robot))
+        if np.abs(np.log(factor)).max() < _SETTLED:
+            break
     apart = [
         f"{name}: {estimate:.3g} against {spec:.3g}"
-        for name, estimate, spec in zip(channels, noise, given, strict=True)
+        for name, estimate, spec in zip(channels, estimate, given, strict=True)
         if spec > 0 and not 0.7 < estimate / spec < 1.4
     ]
     if apart:
         alarms.append("noise floor uncertain, estimated against specified: " + ", ".join(apart))
     return noise, "differences of innovations"
+
+
+def _pieces(logs: Sequence[Log], *, history: int) -> Segments:
+    """Return the segments that noise is estimated on: enough to tell the calm ones, if possible."""
+    shortest = min(len(log) for log in logs) // 2
+    for steps in (_STEPS, _FEWER):
+        pieces = cut(logs, min(steps, shortest), history=history, most=60, burn_in=history)
+        if len(pieces) >= ENOUGH:
+            break
+    return pieces
+
+
+def _most(noise: Array, given: Array, robot: Robot) -> Array:
+    """Return what each channel's noise cannot exceed, shape ``(C,)``.
+
+    Where a missing effect never rests, all that its joint does looks like noise, a hundred times
+    what its sensor has. A sensor is some times worse than its spec, if there is one, or than most
+    of its like, the same readings of the other hinges that motors move.
+    """
+    most = np.where(given > 0, _BEYOND * given, np.inf)
+    if robot.model is None:
+        return most
+    moved = {joint for joint in robot.joint_of_actuator if joint >= 0}
+    for kind in ("position", "velocity"):
+        peers = [
+            c
+            for c, joint in enumerate(robot.channel_joint)
+            if robot.channel_kind[c] == kind and joint in moved and _hinge(robot, joint)
+        ]
+        if len(peers) >= _LIKE:
+            usual = float(np.quantile(noise[peers], 0.25))
+            most[peers] = np.minimum(most[peers], _BEYOND * usual)
+    return most
+
+
+def _hinge(robot: Robot, joint: int) -> bool:
+    model = robot.require_model()
+    kind = model.jnt_type[model.dof_jntid[robot.dof_index[joint]]]
+    return bool(kind == mujoco.mjtJoint.mjJNT_HINGE)
 
 
 def _coordinates(predictor: Predictor, log: Log) -> Array:

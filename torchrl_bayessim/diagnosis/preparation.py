@@ -26,6 +26,7 @@ from .prediction import Predictor
 from .refit import Fit, refit
 from .segments import Segments, cut, cut_for_fits
 from .time_steps import with_fewest_steps
+from .velocity_errors import with_velocity_errors
 
 Array = NDArray[np.float64]
 _HISTORY = 0.4  # seconds of commands that delay lines and filters look back at
@@ -152,6 +153,8 @@ def prepare(
             "runs, and intervals are too narrow"
         )
     history = min(max(8, round(_HISTORY / system.control_dt)), 100)
+    theta = parameters_at(system.prior, origin(system.prior))
+    parts = {name: with_velocity_errors(predictor, part, theta) for name, part in parts.items()}
     noise = assumed_noise(predictor, parts["train"])
     parts = _completed(predictor, parts, noise=noise, history=history, alarms=alarms)
     estimated = parts["train"][0].uncertainty is not None

@@ -42,6 +42,7 @@ class Segments:
         qvel: Velocities, windows, shape ``(S, W, nv)``.
         ctrl: Commands, windows, shape ``(S, W, A)``.
         velocity_gain: Noise of an estimated velocity per noise of the position, ``(nv,)``.
+        velocity_error: Of an estimated velocity, where motion is too fast for it, ``(nv,)``.
         uncertainty: Covariance of what was estimated of each start state, ``(S, 2 nv, 2 nv)``;
             nothing where all that matters was measured.
     """
@@ -56,6 +57,7 @@ class Segments:
     qvel: Array
     ctrl: Array
     velocity_gain: Array
+    velocity_error: Array
     uncertainty: Array | None = None
 
     def __len__(self) -> int:
@@ -142,6 +144,7 @@ def cut(
 
     log, start = np.array(found, dtype=np.int64).T
     gains = np.stack([one.velocity_gain.numpy() for one in logs])
+    errors = [o.velocity_error.numpy() for o in logs if o.velocity_error is not None]
     return Segments(
         horizon,
         history,
@@ -153,6 +156,7 @@ def cut(
         windows("qvel"),
         windows("ctrl"),
         gains.max(0),
+        np.max([np.zeros(gains.shape[1]), *errors], axis=0),
         _uncertainty(logs, found),
     )
 

@@ -159,6 +159,7 @@ class _Record:
             qvel=twice(belief.qvel),
             ctrl=twice(self.ctrl[:, t]),
             velocity_gain=np.zeros(belief.qvel.shape[1]),
+            velocity_error=np.zeros(belief.qvel.shape[1]),
         )
 
 

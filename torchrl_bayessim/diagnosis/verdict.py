@@ -31,6 +31,7 @@ from .shrinkage import Shrinkage
 _NEGLIGIBLE = 0.05  # of the noise floor: an excess that no one would chase
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
 _SHOWN = 1.2  # mean squared innovation of runs that show a gap
+_MOST = 0.5  # of the joints without measured velocity
 _NOISE_AGAIN = 2.0  # mean squared innovation: as much again as the noise
 _ALL, _NAMED, _PARTIAL = 0.98, 0.8, 0.4
 
@@ -68,6 +69,12 @@ def conclude(
     if not _excited(system, prepared):
         verdict = "not_testable"
         alarms.append("commands and motion hardly vary: no effect can be told from another")
+    elif _too_fast(prepared):
+        verdict = "not_testable"
+        alarms.append(
+            f"the robot moves too fast for velocities to be told from positions at "
+            f"{1 / system.control_dt:.3g} Hz: log velocities, or more rows a second"
+        )
     elif not effects and not visible:
         verdict = "none"
     elif not effects:
@@ -127,6 +134,14 @@ def _excited(system: System, prepared: Prepared) -> bool:
     return bool((spread > 5.0 * prepared.noise).any())
 
 
+def _too_fast(prepared: Prepared) -> bool:
+    """Return whether most velocities that were not measured are guesses."""
+    segments = prepared.sets["train"].segments
+    guessed = segments.velocity_gain > 0
+    known = segments.qvel.reshape(-1, segments.qvel.shape[-1]).std(0)
+    return bool(guessed.any() and (segments.velocity_error > known)[guessed].mean() > _MOST)
+
+
 def _sentence(
     verdict: Verdict,
     system: System,
@@ -149,7 +164,8 @@ def _sentence(
     if verdict == "none":
         return f"No gap above noise ({measured.refit:.2f} times the floor).{ruled_out}{untested}"
     if verdict == "not_testable":
-        return f"These data cannot say: record motion that exceeds the noise.{untested}"
+        hint = "sample faster" if _too_fast(prepared) else "record motion that exceeds the noise"
+        return f"These data cannot say: {hint}.{untested}"
     rules = where["regimes"]
     place = f" It sits at {rules[0]['rule']}." if rules else ""
     if verdict == "unknown":

@@ -16,7 +16,7 @@ are innovations: white, of unit variance, for a perfect simulator.
 
 from __future__ import annotations
 
-__all__ = ["Whitening", "innovation_noise", "noise_from_differences", "whitening"]
+__all__ = ["ENOUGH", "Whitening", "innovation_noise", "noise_from_differences", "whitening"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -34,7 +34,7 @@ _KNOWN = 3.0  # times the error of an estimate that knows what it is to predict
 _ROUNDING = 1e-13  # of the largest variance
 _MOST, _HALF, _CALM = 0.9, 0.5, 0.25  # shares of the segments that noise is estimated from
 _UNEVEN = 1.3  # ratio of the first two estimates, beyond which some segments hold more than noise
-_ENOUGH = 40  # segments, to single out a quarter of them
+ENOUGH = 40  # segments, to single out a quarter of them
 _DRAWS = 8  # simulated robots that the whitening is checked on
 _THIRD_DIFFERENCE = 20.0  # 1 + 9 + 9 + 1: variance of y₃ - 3y₂ + 3y₁ - y₀ per unit of white noise
 
@@ -97,7 +97,7 @@ def whitening(
         theta: Parameters, shape ``(D,)``.
         noise: Standard deviation of each channel's noise, shape ``(C,)``.
         generator: To check the whitening on simulated data: a perfect robot is simulated with half
-            the time step and noise of its own; segments whose innovations are larger than one there
+            the time step and noise of its own; rows whose innovations are larger than one there
             (where the linear view of the start's noise fails) are trusted that much less.
     """
     root = _start_noise(predictor, segments, noise)
@@ -126,14 +126,29 @@ def whitening(
         made = moved - finer - (step / 2).reshape(finer.shape)
         made += noise * generator.standard_normal(moved.shape)
         white = np.matmul(inverse, np.nan_to_num(made, nan=_WORST).reshape(_DRAWS, size, -1, 1))
-        excess = np.minimum((white**2).mean((0, 2, 3)), _WORST)
-        inverse /= np.sqrt(np.maximum(excess, 1.0))[:, None, None]
+        excess = _excess((white**2).reshape(_DRAWS, size, checks, channels))
+        inverse /= np.sqrt(np.repeat(excess, channels, axis=1))[..., None]
     variance = np.diagonal(spread, axis1=1, axis2=2).reshape(size, checks, channels)
     bent = np.linalg.norm(curve, axis=(0, 2)) / np.maximum(
         np.linalg.norm(slope, axis=(0, 2)), 1e-12
     )
     drift = np.matmul(inverse, step[..., None])[..., 0]
     return Whitening(inverse, np.ones(size), np.sqrt(variance), drift, float(np.median(bent)))
+
+
+def _excess(squares: Array) -> Array:
+    """Return how much larger than one squares of simulated innovations are, 1 at least, ``(S, K)``.
+
+    Until something touches the ground a segment is as predictable as the others: so rows that are
+    certainly worse count by themselves, and the others of the segment together.
+
+    Args:
+        squares: Shape ``(draws, S, K, C)``.
+    """
+    rows = np.minimum(squares.mean((0, 3)), _WORST)
+    loud = rows > 1.0 + 3.0 * np.sqrt(2.0 / (squares.shape[0] * squares.shape[3]))
+    others = np.where(loud, 0.0, rows).sum(1) / np.maximum((~loud).sum(1), 1)
+    return np.where(loud, rows, np.maximum(others, 1.0)[:, None])
 
 
 def _start_noise(predictor: Predictor, segments: Segments, noise: Array) -> Array:
@@ -147,7 +162,7 @@ def _start_noise(predictor: Predictor, segments: Segments, noise: Array) -> Arra
     # An estimated velocity knows of the rows that it is to predict: three times its noise leaves
     # the segment itself to say how fast it began.
     estimated = _KNOWN * segments.velocity_gain * start[:size]
-    start[size:] = np.maximum(start[size:], estimated)
+    start[size:] = np.maximum(start[size:], np.maximum(estimated, segments.velocity_error))
     steps = np.diag(start)[start > 0]
     steps = np.broadcast_to(steps[:, None], (len(steps), len(segments), 2 * size))
     if segments.uncertainty is None:
@@ -208,5 +223,5 @@ def innovation_noise(innovations: Array, pushes: Array, checks: int) -> Array:
         spread(innovations, share) / np.mean([spread(one, share) for one in noise], axis=0)
         for share in (_MOST, _HALF, _CALM)
     )
-    uneven = (most > _UNEVEN * half) & (len(innovations) >= _ENOUGH)
+    uneven = (most > _UNEVEN * half) & (len(innovations) >= ENOUGH)
     return np.sqrt(np.where(uneven, calm, most))

@@ -21,6 +21,8 @@ class Log:
         ctrl: Shape ``(T, nu)``.
         velocity_gain: The standard deviation of an estimated velocity per unit of position noise,
             1/s; 0 where the velocity was measured, shape ``(nv,)``.
+        velocity_error: Typical error of an estimated velocity where the robot moves too fast for
+            the sampling, shape ``(nv,)``; nothing where nobody has looked.
         measured: Which of the ``2 nv`` tangent coordinates were measured, boolean.
         first_row: The row of the file (from 0, without the header) where it begins; 0 means that
             the beginning of the trajectory is known.
@@ -38,6 +40,7 @@ class Log:
     velocity_gain: Tensor
     measured: Tensor
     first_row: int = 0
+    velocity_error: Tensor | None = None
     uncertainty: Tensor | None = None
 
     def __len__(self) -> int:
