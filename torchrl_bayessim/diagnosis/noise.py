@@ -45,7 +45,7 @@ def measured_noise(
     given = np.array([system.noise.get(name, np.nan) for name in channels])
     pieces = _pieces(logs, history=history)
     pushes = pushes_of(system.robot)
-    z = origin(system.prior)
+    z, estimate = origin(system.prior), noise
     for _ in range(_ROUNDS):
         white = whitening(predictor, pieces, parameters_at(system.prior, z), noise)
         objective = Objective(predictor, system.prior, pieces, white)

@@ -44,7 +44,8 @@ def with_velocity_errors(predictor: Predictor, logs: Sequence[Log], theta: Array
         positions, velocities = _motion(predictor, log, theta)
         if len(positions) < _ROWS:
             continue
-        windows = Windows(predictor.system.control_dt * np.arange(len(positions)))
+        rows = np.arange(len(positions), dtype=np.float64)
+        windows = Windows(predictor.system.control_dt * rows)
         for q, v in zip(robot.qpos_index, robot.dof_index, strict=True):
             if log.velocity_gain[v] > 0:
                 slope, _, half = velocity(windows, positions[:, q])
