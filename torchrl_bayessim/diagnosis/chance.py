@@ -53,6 +53,8 @@ class Chance:
         error: Standard deviation of that.
         gain: Deviance gained over the best explanation without chance.
         left: Mean squares of its standardised innovations in test segments, shape ``(S,)``.
+        before: Mean square of the innovations of these segments without it, where they are others
+            than those of the other figures.
     """
 
     unit: Unit
@@ -60,6 +62,7 @@ class Chance:
     error: float
     gain: float
     left: Array
+    before: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,6 +26,7 @@ from ..physics.mujoco import MujocoPhysics
 from .chance import chances, detectable, of_chance
 from .evidence import assemble
 from .holds import bridged
+from .losses import losses
 from .modes import MODES
 from .objective import Unit, pushes_of, units_of
 from .onsets import with_onsets
@@ -108,7 +109,7 @@ def diagnose(
         )
         random = of_chance(every)
         progress("looking for scatter")
-        found = chances(prepared.sets, selection, random)
+        found = losses(prepared, selection, every) or chances(prepared.sets, selection, random)
         least = detectable(prepared.sets["train"], selection, random)
         progress("opening the test runs")
         return assemble(

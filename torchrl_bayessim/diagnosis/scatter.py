@@ -69,14 +69,18 @@ class Scatter:
 
     def measured(self, before: Shrinkage, generator: np.random.Generator) -> Shrinkage:
         """Return how far the gap shrinks with the likeliest, standardised by its own scatter."""
-        left = self.found[0].left
+        left, refit = self.found[0].left, before.refit
+        if self.found[0].before is not None:
+            refit = self.found[0].before
         draws = left[generator.integers(len(left), size=(_DRAWS, len(left)))].mean(1)
-        excess = max(before.refit - 1.0, 1e-9)
+        excess = max(refit - 1.0, 1e-2)  # less cannot be shared out
         low, high = np.quantile(draws, [0.025, 0.975]).tolist()
         after = float(left.mean())
-        share = [min((before.refit - value) / excess, 1.0) for value in (after, high, low)]
+        share = [min((refit - value) / excess, 1.0) for value in (after, high, low)]
         return replace(
             before,
+            raw=max(before.raw, refit),
+            refit=refit,
             effects=after,
             explained=share[0],
             explained_ci=(share[1], share[2]),

@@ -54,7 +54,7 @@ def conclude(
     groups = {u.effect.group for u in selection.best.units if u.name in confused[:1]}
     groups |= {u.effect.group for s in selection.screens[:1] for u in s.units if u.name in confused}
     groups |= scattered
-    significant = selection.p_values[0] <= alpha
+    significant = selection.p_values[0] <= alpha or bool(scattered)
     splits = [float((m**2).mean()) for m in
               (selection.nominal.fit.innovations, selection.nominal.validation)]  # fmt: skip
     visible = measured.excess_ci[0] > 0 and min(measured.refit, *splits) > _UNEXPLAINED
@@ -62,7 +62,7 @@ def conclude(
     nearly_all = measured.explained >= _ALL and measured.effects <= _NOISE_AGAIN
     left = measured.remainder_ci[0] > _NEGLIGIBLE and not nearly_all
     validated = _validated(selection)
-    perhaps_nothing = measured.explained_ci[0] <= 0 and validated < _PARTIAL
+    perhaps_nothing = measured.explained_ci[0] <= 0 and validated < _PARTIAL and not scattered
     unsaid = measured.explained < _PARTIAL or perhaps_nothing
     elsewhere = unsaid and _hardly_shown(measured) and validated >= _NAMED
     verdict: Verdict

@@ -1,0 +1,85 @@
+"""Commands and samples that are lost now and then are found one by one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from test_chance import lost
+from test_diagnose import logs, system
+
+from torchrl_bayessim.diagnosis.diagnose import diagnose
+
+SOME = ("action_delay", "action_jitter", "packet_drop", "sensor_dropout", "coulomb_friction")
+
+
+def shown_again(log, share, rng):
+    """Return the log with angles that are sometimes the last one, with noise of their own."""
+    angles = log.qpos.clone()
+    for k in range(1, len(angles)):
+        if rng.random() < share:
+            angles[k] = angles[k - 1]
+    noise = torch.from_numpy(rng.normal(scale=0.0005, size=angles.shape))
+    return replace(log, qpos=angles + noise)
+
+
+def rough(share, rng):
+    """Commands that jump, as a policy's do, and are lost now and then."""
+    arrives = lost(share, rng)
+
+    def act(u, k):
+        if k == 0:
+            u += rng.normal(size=len(u))
+        return arrives(u, k)
+
+    return act
+
+
+def explained(report):
+    return report.gap.explained_fraction
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1])
+def test_rare_losses_of_commands_are_counted(share):
+    act = rough(share, np.random.default_rng(1))
+    report = diagnose(system(), None, logs(8, act=act), effects=SOME)
+    assert report.verdict in {"named", "named_partial"}
+    (found,) = report.effects
+    assert (found.name, found.where) == ("packet_drop", "motor")
+    assert report.confusion_set == ("packet_drop",)
+    assert found.strength == pytest.approx(share, rel=0.5)
+    assert explained(report) > 0.5
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1])
+def test_samples_that_are_not_renewed_are_counted_though_they_never_repeat(share):
+    rng = np.random.default_rng(2)
+    data = [shown_again(log, share, rng) for log in logs(8)]
+    report = diagnose(system(), None, data, effects=SOME)
+    assert report.verdict in {"named", "named_partial"}
+    (found,) = report.effects
+    assert (found.name, found.where) == ("sensor_dropout", "hinge position")
+    assert found.strength == pytest.approx(share, rel=0.5)
+    assert explained(report) > 0.8
+
+
+def test_nothing_is_lost_where_something_else_strikes_now_and_then():
+    """Blows spoil as many segments as losses would, and no pattern of losses explains them."""
+    rng = np.random.default_rng(3)
+    report = diagnose(
+        system(), None, logs(8, act=lambda u, k: u[k] + 3.0 * (rng.random() < 0.05)), effects=SOME
+    )
+    names = {effect.name for effect in report.effects}
+    assert not names & {"packet_drop", "sensor_dropout"}
+
+
+def test_nothing_is_lost_on_a_clean_robot():
+    report = diagnose(system(), None, logs(8, seed=5), effects=SOME)
+    assert report.verdict == "none"
+
+
+def test_samples_and_commands_are_told_apart():
+    """Half of each would explain the other's scatter, none of it one by one."""
+    rng = np.random.default_rng(4)
+    data = [shown_again(log, 0.2, rng) for log in logs(8)]
+    assert diagnose(system(), None, data, effects=SOME).confusion_set == ("sensor_dropout",)

@@ -1,0 +1,207 @@
+"""Losses, found one by one: commands that did not arrive, samples that were not renewed.
+
+A value that is lost leaves the last one in its place. If one in fifty is, most segments have none,
+and their mean and covariance say little; but where it happened it can be seen. In short segments
+every pattern of a few losses is tried (`loss_law`), and what must be beaten is the same law without
+losses, where some segments are spoiled by something else: losses have to explain what they spoil,
+and not only that some segments are worse than others.
+
+Effects of commands are linear in them over so few steps, so every pattern is made of one simulation
+per step; those of samples are the simulated values.
+"""
+
+from __future__ import annotations
+
+__all__ = ["losses"]
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..effects.action import PacketDrop
+from ..effects.sensors import SensorDropout
+from .chance import Chance
+from .loss_law import LossLaw, Told, Tried
+from .modes import Mode
+from .objective import Objective, Point, Unit
+from .preparation import Prepared
+from .segments import cut
+from .selection import Selection
+
+Array = NDArray[np.float64]
+Patterns = Sequence[tuple[bool, ...]]
+_STEPS = 8  # of a segment
+_TOGETHER = 3  # losses in a segment, at most
+_MOST = {"train": 90, "validation": 45, "test": 45}  # segments
+_SHARES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.25, 0.4, 0.6)  # s
+_SCATTER = np.geomspace(0.5, 4.0, 10)  # φ
+_SPOILED = (0.003, 0.01, 0.03, 0.1, 0.3)  # η
+_NUDGE = 0.2  # of the largest command
+# deviances: to be found (contacts that come late look like a few losses), and that chance makes
+_NEEDED, _LIKELY = 40.0, 6.0
+_EXPLAINED = 0.5  # of the excess of the segments concerned, by what is left of them
+_FEWEST = 4  # segments with a loss
+_LIKELIER = 0.5  # probability that a segment has a loss, or is spoiled
+
+
+@dataclass(frozen=True, eq=False)
+class _Data:
+    """Short segments of a split.
+
+    Attributes:
+        objective: Evaluates them.
+        point: The simulator.
+        left: Its innovations, shape ``(S, M)``.
+    """
+
+    objective: Objective
+    point: Point
+    left: Array
+
+    def without(self, point: Point) -> Tried:
+        """Return the segments without losses, in some simulator."""
+        squares = (self.objective([point])[0] ** 2).mean(-1)[None]
+        return Tried(squares, np.zeros(1, dtype=np.int64), self.objective.segments.horizon)
+
+    def tried(self, unit: Unit) -> Tried:
+        """Return the segments under every pattern of losses."""
+        target, steps = int(np.argmax(unit.direction)), self.objective.segments.horizon
+        if isinstance(unit.effect, PacketDrop):
+            patterns = _patterns(steps)
+            changes = self._of_commands(target, patterns)
+        else:
+            patterns = _patterns(1 + steps)
+            changes = self._of_samples(target, patterns)
+        squares = np.stack([((self.left + change) ** 2).mean(-1) for change in changes])
+        return Tried(squares, np.array([sum(p) for p in patterns]), len(patterns[0]))
+
+    def _of_commands(self, actuator: int, patterns: Patterns) -> Iterator[Array]:
+        """Yield what each pattern of lost commands changes, ``(S, M)``."""
+        segments, robot = self.objective.segments, self.objective.predictor.system.robot
+        at, steps = segments.history, segments.horizon
+        sent = segments.ctrl[:, at - 1 : at + steps, actuator]
+        nudge = -_NUDGE * float(robot.command_scale[actuator]) * np.where(sent > 0, 1.0, -1.0)
+        slopes = []
+        for t in range(steps):
+            ctrl = segments.ctrl.copy()
+            ctrl[:, at + t, actuator] += nudge[:, 1 + t]
+            moved = self.objective.along(replace(segments, ctrl=ctrl))([self.point])[0]
+            slopes.append((moved - self.left) / nudge[:, 1 + t, None])
+        for lost in patterns:
+            arrived = sent[:, _last(lost)] - sent[:, 1:]
+            yield np.einsum("st,tsm->sm", arrived, np.stack(slopes))
+
+    def _of_samples(self, channel: int, patterns: Patterns) -> Iterator[Array]:
+        """Yield what each pattern of samples, the start's first, changes, ``(S, M)``."""
+        objective, segments = self.objective, self.objective.segments
+        predictor, at = objective.predictor, segments.history
+        sensing = predictor.sensing
+        qpos, qvel = predictor.states(segments, objective.theta(self.point.z[None]))
+        first = sensing.values(segments.qpos[:, at], segments.qvel[:, at])[:, channel]
+        shown = np.c_[first, np.nan_to_num(sensing.values(qpos[0], qvel[0])[..., channel])]
+        # a start that was not renewed is where the robot was a step before
+        offsets = np.zeros((1, len(segments), 2 * predictor.tangent.size))
+        offsets[0, :, sensing.channels[channel]] = shown[:, 1] - shown[:, 0]
+        start = objective([self.point], offsets)[0] - self.left
+        columns = objective.whitening.inverse[:, :, channel :: len(sensing.channels)]
+        for begin, *lost in patterns:
+            # what was measured, minus what would have been shown
+            error = shown[:, 1:] - shown[:, _last(lost)]
+            yield np.einsum("smt,st->sm", columns, error) + begin * start
+
+
+def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> list[Chance]:
+    """Return the losses that explain what is wrong with the segments that have them.
+
+    The likeliest first, with those that are nearly as likely; none where whole trajectories or
+    statistics are compared.
+
+    Args:
+        prepared: Logs, noise and nominal fit.
+        selection: What the search without chance found.
+        units: Random effects at their targets; of those lost commands and samples of one target.
+    """
+    some = [u for u in units if isinstance(u.effect, PacketDrop | SensorDropout) and _single(u)]
+    if not some or type(prepared.mode) is not Mode:
+        return []
+    data = _cut(prepared)
+    judged = [data["train"], data["validation"]]
+    nominal, best = (
+        [one.without(point) for one in judged]
+        for point in (judged[0].point, selection.best.fit.point)
+    )
+    size = judged[0].left.shape[1]
+    laws = [LossLaw(0.0, *some, size) for some in product(_SCATTER.tolist(), _SPOILED)]
+    base = min(laws, key=lambda law: law.deviance(nominal))
+    # what the best explanation without chance gains by the same standard
+    least = max(_NEEDED, base.deviance(nominal) - base.deviance(best))
+    found = [_found(data, unit, base) for unit in some]
+    kept = [one for one in found if one is not None and one.gain > least]
+    kept.sort(key=lambda one: -one.gain)
+    return [one for one in kept if one.gain > kept[0].gain - _LIKELY]
+
+
+def _single(unit: Unit) -> bool:
+    return unit.where != "all" or len(unit.direction) == 1
+
+
+def _patterns(values: int) -> Patterns:
+    """Return the patterns of a few losses among so many values, none first."""
+    some = [c for count in range(_TOGETHER + 1) for c in combinations(range(values), count)]
+    return [tuple(value in lost for value in range(values)) for lost in some]
+
+
+def _last(lost: Sequence[bool]) -> list[int]:
+    """Return for every step the one whose value is there, counted from the one before the first."""
+    last = [0]
+    for step, missing in enumerate(lost, 1):
+        last.append(last[-1] if missing else step)
+    return last[1:]
+
+
+def _cut(prepared: Prepared) -> dict[str, _Data]:
+    """Return short segments of every split, compared after each of their steps."""
+    prior, point = prepared.predictor.system.prior, Point(prepared.nominal.point.z)
+    history = max(prepared.sets["train"].segments.history, 1)
+    found = {}
+    for name, logs in prepared.logs.items():
+        pieces = cut(logs, _STEPS, history=history, most=_MOST[name], burn_in=history)
+        objective = prepared.mode.objective(
+            prepared.predictor, prior, pieces, z=point.z, noise=prepared.noise
+        )
+        found[name] = _Data(objective, point, objective([point])[0])
+    return found
+
+
+def _found(data: Mapping[str, _Data], unit: Unit, base: LossLaw) -> Chance | None:
+    """Return the losses of a unit, nothing if they do not explain what they spoil."""
+    tried = {name: one.tried(unit) for name, one in data.items()}
+    judged = [tried[name] for name in ("train", "validation")]
+    laws = [replace(base, share=s, spoiled=e) for s, e in product(_SHARES, _SPOILED)]
+    law = min(laws, key=lambda law: law.deviance(judged))
+    gains = [base.deviance([one.without]) - law.deviance([one]) for one in judged]
+    if sum(gains) < _NEEDED or gains[1] < -_LIKELY:
+        return None
+    told = {name: law.told(one) for name, one in tried.items()}
+    known = Told.joined([told["train"], told["validation"]])
+    concerned = known.lost > _LIKELIER
+    excess = [float((one[concerned] - law.scatter).sum()) for one in (known.before, known.after)]
+    if concerned.sum() < _FEWEST or excess[1] > _EXPLAINED * excess[0]:
+        return None
+    rows = len(known.count) * judged[0].values
+    share = min(float(known.count.sum()) / rows, unit.high)
+    shown = told["test"]
+    if (shown.lost > _LIKELIER).sum() < _FEWEST:  # so rare that test runs have hardly any
+        shown = Told.joined(list(told.values()))
+    sound = shown.spoiled <= _LIKELIER
+    return Chance(
+        unit=unit,
+        strength=share,
+        error=float(np.sqrt(share * (1 - share) / rows)),
+        gain=sum(gains),
+        left=shown.after[sound],
+        before=float(shown.before[sound].mean()),
+    )
