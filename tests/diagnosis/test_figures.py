@@ -96,6 +96,22 @@ def test_figures_are_in_units_of_the_floor(searched):
     assert halved.explained == pytest.approx(expected)
 
 
+def test_all_of_the_gap_is_never_sure(searched):
+    """The floor itself is known to a few per cent only, and other runs are other motions."""
+    prepared, selection = searched
+    points = [Point(np.zeros_like(selection.best.fit.point.z)), selection.nominal.fit.point]
+    points.append(selection.best.fit.point)
+    measured = shrinkage(
+        prepared.sets["test"],
+        points,
+        np.random.default_rng(0),
+        beside=prepared.sets["validation"],
+    )
+    low, high = measured.explained_ci
+    assert 0.9 < low < measured.explained <= high <= 1.0
+    assert low < 0.9999
+
+
 def test_they_are_plain_numbers(drawn):
     text = json.dumps(drawn, allow_nan=False)
     assert json.loads(text) == drawn

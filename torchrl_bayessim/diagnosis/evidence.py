@@ -69,7 +69,13 @@ def assemble(
     best, nominal = selection.best, selection.nominal
     zero = Point(np.zeros_like(nominal.fit.point.z))
     points = [zero, nominal.fit.point, best.fit.point]
-    measured = shrinkage(test, points, generator, floor=_floor(selection, prepared.sets))
+    measured = shrinkage(
+        test,
+        points,
+        generator,
+        floor=_floor(selection, prepared.sets),
+        beside=prepared.sets["validation"],
+    )
     credit = _credit(selection)
     confused = confusion_set(selection, max(credit, key=credit.__getitem__)) if credit else ()
     alarms = [*prepared.alarms, *(str(f) for f in findings)]

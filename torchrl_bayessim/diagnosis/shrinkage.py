@@ -21,6 +21,8 @@ from .objective import Objective, Point
 
 Array = NDArray[np.float64]
 _DRAWS = 1000
+_LOGS = 4  # from which on whole trajectories are resampled
+_FLOOR_ERROR = 0.05  # relative standard deviation of a noise floor, squared units
 
 
 @dataclass(frozen=True)
@@ -52,8 +54,14 @@ def shrinkage(
     generator: np.random.Generator,
     *,
     floor: float = 1.0,
+    beside: Objective | None = None,
 ) -> Shrinkage:
     """Return the figures for three points: prior mean, refit, with effects.
+
+    Whole trajectories are resampled where there are four of them or more, else segments. The share
+    explained is meant for other motions too, and what differs between trajectories is more than
+    what differs between segments of two: its interval resamples those of validation as well, and
+    the floor with them, which is known to a few per cent only.
 
     Args:
         test: Segments of the test runs.
@@ -62,30 +70,43 @@ def shrinkage(
         floor: Mean squared innovation of a perfect simulator, where it is known to be less than 1:
             covariances that must allow for chaos, or for velocities that were not measured, allow
             for more than there is. All figures are in units of it.
-
-    Whole trajectories are resampled where there are four of them or more, else segments.
+        beside: Segments of the validation runs.
     """
-    innovations = test(points)
-    weight = test.whitening.weights**2
-    per = (innovations**2).sum(-1)
-    size = floor * weight * innovations.shape[2]
-    groups = test.segments.log
-    if len(np.unique(groups)) < 4:
-        groups = np.arange(len(per[0]))
-    names, index = np.unique(groups, return_inverse=True)
-    sums = np.stack([np.bincount(index, p, len(names)) for p in (*per, size)])
-    draws = generator.integers(len(names), size=(_DRAWS, len(names)))
-    raw, refit, effects = (float(s.sum() / sums[3].sum()) for s in sums[:3])
-    resampled = sums[:, draws].sum(-1)
-    refits, after = resampled[1] / resampled[3], resampled[2] / resampled[3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = (refits - after) / np.where(refits > 1.0, refits - 1.0, np.nan)
+    own = _sums(test, points, floor)
+    raw, refit, effects = (float(s.sum() / own[3].sum()) for s in own[:3])
     # noise may leave less than its mean; more than all cannot be explained
     explained = min((refit - effects) / (refit - 1.0), 1.0) if refit > 1.0 else 0.0
+    _, refits, after = _resampled(own, generator)
+    wider = own if beside is None else np.concatenate([own, _sums(beside, points, floor)], 1)
+    _, before, left = _resampled(wider, generator)
+    least = np.minimum(left, 1.0) * (1.0 + _FLOOR_ERROR * generator.standard_normal(len(left)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = (before - left) / np.where(before > 1.0, before - least, np.nan)
+    low, high = _interval(np.minimum(ratios, 1.0))
     return Shrinkage(
         raw, refit, effects, explained,
-        _interval(np.minimum(ratios, 1.0)), _interval(refits - 1.0), _interval(after - 1.0),
+        (min(low, explained), max(high, explained)),
+        _interval(refits - 1.0), _interval(after - 1.0),
     )  # fmt: skip
+
+
+def _sums(objective: Objective, points: Sequence[Point], floor: float) -> Array:
+    """Return squares of the three points and their number, summed over units to resample."""
+    innovations = objective(points)
+    size = floor * objective.whitening.weights**2 * innovations.shape[2]
+    groups = objective.segments.log
+    if len(np.unique(groups)) < _LOGS:
+        groups = np.arange(len(size))
+    names, index = np.unique(groups, return_inverse=True)
+    per = (*(innovations**2).sum(-1), size)
+    return np.array([np.bincount(index, one, len(names)) for one in per], dtype=np.float64)
+
+
+def _resampled(sums: Array, generator: np.random.Generator) -> Array:
+    """Return mean squares of the three points in bootstrap draws, shape ``(3, draws)``."""
+    count = sums.shape[1]
+    drawn = sums[:, generator.integers(count, size=(_DRAWS, count))].sum(-1)
+    return drawn[:3] / drawn[3]
 
 
 def _interval(values: Array) -> tuple[float, float]:
