@@ -43,6 +43,8 @@ _NUDGE = 0.2  # of the largest command
 # deviances: to be found (contacts that come late look like a few losses), and that chance makes
 _NEEDED, _LIKELY = 40.0, 6.0
 _EXPLAINED = 0.5  # of the excess of the segments concerned, by what is left of them
+_NOISE = 1.2  # scatter that noise has
+_OTHERS = 1 / 6  # of the segments that something else may have spoiled
 _FEWEST = 4  # segments with a loss
 _LIKELIER = 0.5  # probability that a segment has a loss, or is spoiled
 
@@ -187,6 +189,8 @@ def _found(data: Mapping[str, _Data], unit: Unit, base: LossLaw) -> Chance | Non
         return None
     told = {name: law.told(one) for name, one in tried.items()}
     known = Told.joined([told["train"], told["validation"]])
+    if law.scatter > _NOISE or (known.spoiled > _LIKELIER).mean() > _OTHERS:
+        return None  # something else is wrong everywhere, and may look like this
     concerned = known.lost > _LIKELIER
     excess = [float((one[concerned] - law.scatter).sum()) for one in (known.before, known.after)]
     if concerned.sum() < _FEWEST or excess[1] > _EXPLAINED * excess[0]:

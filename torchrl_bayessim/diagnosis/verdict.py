@@ -31,6 +31,7 @@ from .shrinkage import Shrinkage
 _NEGLIGIBLE = 0.05  # of the noise floor: an excess that no one would chase
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
 _SHOWN = 1.2  # mean squared innovation of runs that show a gap
+_CERTAIN = 1e-15  # p-value of a gap that is too small to be seen at a glance
 _MOST = 0.5  # of the joints without measured velocity
 _NOISE_AGAIN = 2.0  # mean squared innovation: as much again as the noise
 _ALL, _NAMED, _PARTIAL = 0.98, 0.8, 0.4
@@ -83,7 +84,8 @@ def conclude(
         # seen by the search, but too small to matter on the test runs
         verdict = "none" if not significant else "named_partial"
     elif unsaid:
-        verdict = "named_partial" if elsewhere else "unknown"
+        sure = visible or selection.p_values[0] < _CERTAIN
+        verdict = "named_partial" if elsewhere else "unknown" if sure else "none"
     elif len(groups) > 1 and len(confused) > 1:
         verdict = "ambiguous"
     elif measured.explained >= _NAMED and not left:

@@ -35,7 +35,7 @@ _ROUNDING = 1e-13  # of the largest variance
 _MOST, _HALF, _CALM = 0.9, 0.5, 0.25  # shares of the segments that noise is estimated from
 _UNEVEN = 1.3  # ratio of the first two estimates, beyond which some segments hold more than noise
 ENOUGH = 40  # segments, to single out a quarter of them
-_DRAWS = 8  # simulated robots that the whitening is checked on
+_DRAWS = 24  # simulated robots that the whitening is checked on
 _THIRD_DIFFERENCE = 20.0  # 1 + 9 + 9 + 1: variance of y₃ - 3y₂ + 3y₁ - y₀ per unit of white noise
 
 
