@@ -51,6 +51,17 @@ class Settings:
 S = TypeVar("S", bound=Settings)
 
 
+_EXPECTED = (
+    ValueError,
+    TypeError,
+    KeyError,
+    OSError,
+    ImportError,
+    MemoryError,
+    BayesSimError,
+)  # which are told in one line
+
+
 def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> None:
     """Run ``job(settings, folder)`` with the command line's settings, and report its result.
 
@@ -69,12 +80,12 @@ def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> No
         if hasattr(settings, "resume"):
             made = [*begun(settings, folder), *made]
         result = job(settings, folder)
-    except (ValueError, TypeError, KeyError, OSError, ImportError, BayesSimError) as error:
+    except _EXPECTED as error:
         leave(made)
         if debugging(sys.argv[1:]):
             raise
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
-        print(f"{name}: {' '.join(str(text).split())}", file=sys.stderr)
+        print(f"{name}: {' '.join(str(text).split()) or type(error).__name__}", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         print(f"{name}: stopped; resume=FOLDER goes on where a recipe has it", file=sys.stderr)

@@ -314,3 +314,9 @@ def test_without_ray_its_extra_is_named(monkeypatch):
     monkeypatch.setattr(ray_collectors, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"the package ray, got 'none'.*torchrl_bayessim\[ray\]"):
         RayCollectors(make, learner().policy, environments=6, steps=3)
+
+
+def test_collectors_that_were_shut_down_say_so(collectors, monkeypatch):
+    monkeypatch.setattr(collectors, "_ended", True)  # as shutdown() leaves them
+    with pytest.raises(RuntimeError, match=r"workers, got 'collectors that were shut down'"):
+        pairs(SummaryStatistics(moments), collectors=collectors)

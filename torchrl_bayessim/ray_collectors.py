@@ -72,6 +72,8 @@ class RayCollectors:
             loop = SimToRealLoop(env, ppo, robot, collectors=collectors, ...)
     """
 
+    _ended = False
+
     def __init__(
         self,
         make: Callable[[int], EnvBase],
@@ -135,6 +137,7 @@ class RayCollectors:
 
     def shutdown(self) -> None:
         """End the workers, and the cluster if it was begun here."""
+        self._ended = True
         self._collector.shutdown()
         self._end_cluster()
 
@@ -260,6 +263,9 @@ class RayCollectors:
 
     def _ask(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Return every worker's answer; Ray begins those anew that die, and asks them again."""
+        if self._ended:
+            got = "collectors that were shut down"
+            raise RuntimeError(message("collectors with workers", got, hint="begin new ones"))
         with self._errors():
             return self._collector.map_fn(method, list(arguments))
 

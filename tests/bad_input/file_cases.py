@@ -232,6 +232,13 @@ def tensordicts():
         return change
 
     yield spoilt("cut", lambda f: os.truncate(f / "q.memmap", 1000))
+    linked = lambda f: ((f / "q.memmap").rename(f / "r"), (f / "q.memmap").symlink_to("r"))
+    yield spoilt("with a link", linked)
+    nameless = lambda m: m.update({"": {"shape": [4, 160], "dtype": "torch.float64"}})
+    yield spoilt(
+        "with a short nameless entry",
+        lambda f: ((f / ".memmap").write_bytes(b"short"), meta(nameless)(f)),
+    )
     yield spoilt("emptied", lambda f: os.truncate(f / "q.memmap", 0))
     yield spoilt("without a column", lambda f: (f / "q.memmap").unlink(), "got 'q'")
     yield spoilt("with a pipe", lambda f: ((f / "q.memmap").unlink(), os.mkfifo(f / "q.memmap")))

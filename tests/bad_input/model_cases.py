@@ -137,6 +137,22 @@ def namespaces():
     yield xml("bomb in a namespace", inside(many, "<body"), "a namespace")
 
 
+def backslashes():
+    """Name folders with a letter that MuJoCo takes for their separator."""
+    said = "names of files with / between folders"
+    parts = {
+        "include": '<include file="..\\secret.xml"/>',
+        "include from within": '<include file="logs\\..\\..\\secret.xml"/>',
+        "include of its own": '<include file=".\\part.xml"/>',
+        "mesh": '<asset><mesh name="m" file="..\\secret.obj"/></asset>',
+        "folder of meshes": '<compiler meshdir="..\\"/>',
+        "model": '<asset><model name="m" file="..\\secret.xml"/></asset>',
+        "model of itself": '<asset><model name="m" file="logs\\..\\robot.xml"/></asset>',
+    }
+    for name, part in parts.items():
+        yield xml(f"{name} by backslashes", inside(part), said, part_xml="<mujoco/>")
+
+
 def broken():
     """Write XML that is none, or none of MuJoCo's."""
     contents = {
@@ -226,4 +242,13 @@ def bombs():
     yield Case(name="XML of a huge picture", spoil=picture, said="at most")
 
 
-CASES = [*cut_off(), *leaving(), *links(), *entities(), *namespaces(), *broken(), *bombs()]
+CASES = [
+    *cut_off(),
+    *leaving(),
+    *links(),
+    *entities(),
+    *namespaces(),
+    *backslashes(),
+    *broken(),
+    *bombs(),
+]

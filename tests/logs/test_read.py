@@ -2,6 +2,8 @@
 
 import importlib.util
 import json
+import sys
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -168,6 +170,38 @@ def test_minari_without_minari(tmp_path, pendulum):
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "metadata.json").write_text("{}")
     with pytest.raises(ImportError, match=r"torchrl_bayessim\[minari\]"):
+        read_records(tmp_path, pendulum)
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        {"env_spec": '{"entry_point": "subprocess:run"}'},
+        {"env_spec": "{}", "observation_space": "{}"},
+        {"observation_space": {}, "action_space": {}},
+        {},
+        [],
+        None,
+    ],
+)
+def test_minari_never_makes_the_environment_that_a_dataset_names(
+    tmp_path, monkeypatch, pendulum, metadata
+):
+    """It does so where the metadata lack a space, and an entry point may be anything."""
+
+    class Opened:
+        def __init__(self, _):
+            raise AssertionError("opened")
+
+    monkeypatch.setitem(sys.modules, "minari", SimpleNamespace(MinariDataset=Opened))
+    (tmp_path / "data").mkdir()
+    file = tmp_path / "data" / "metadata.json"
+    file.write_text("[" if metadata is None else json.dumps(metadata))
+    with pytest.raises(ValueError, match=r"whose metadata\.json has its spaces"):
+        read_records(tmp_path, pendulum)
+    spaces = {"observation_space": "{}", "action_space": "{}"}
+    file.write_text(json.dumps(spaces))
+    with pytest.raises(ValueError, match=r"a Minari dataset in .*, got 'opened'"):
         read_records(tmp_path, pendulum)
 
 

@@ -52,8 +52,11 @@ def _check(folder: Path, *, depth: int) -> None:
     if math.prod(meta.get("shape", ())) > _MOST or depth > _DEEPEST:
         raise ValueError(f"shape {meta.get('shape')}, folder {depth} of folders within each other")
     for path in folder.iterdir():
-        if path.suffix == ".memmap":
-            for key in {path.stem, unquote(path.stem)} & entries.keys():
+        if path.is_symlink():  # mapping a file may change it, wherever it is
+            raise ValueError(f"{path.name}, which is a link")
+        if path.name.endswith(".memmap"):
+            stem = path.name.removesuffix(".memmap")  # may be empty, which is no suffix then
+            for key in {stem, unquote(stem)} & entries.keys():
                 _check_length(path, entries[key])
         elif path.is_dir() and (path / "meta.json").is_file():
             _check(path, depth=depth + 1)

@@ -100,15 +100,24 @@ def _dirs(roots: dict[Path, Element]) -> set[Path]:
         for element in root.iter("compiler")
         for key in _FOLDERS
     ]
+    for name in given:
+        _require_plain(name)
     return {path.parent / name for path in roots for name in ("", *given)}
+
+
+def _require_plain(name: str) -> None:
+    """Raise a ValueError for a backslash: a letter here, and the way to a folder for MuJoCo."""
+    if "\\" in name:
+        raise ValueError(message("names of files with / between folders", name[:80]))
 
 
 def _named(folder: Path, element: Element, dirs: set[Path]) -> Iterator[Path]:
     """Yield the files that an element names, and that exist."""
     names = [value for key, value in element.attrib.items() if key.startswith("file") and value]
-    if element.tag == "config" and "/" in element.get("value", ""):  # of a plugin
+    if element.tag == "config" and {"/", "\\"} & set(element.get("value", "")):  # of a plugin
         names.append(element.get("value", ""))
     for name in names:
+        _require_plain(name)
         for path in sorted({inside(folder, place / name, name) for place in dirs}):
             if path.is_file():
                 yield path

@@ -11,6 +11,7 @@ from __future__ import annotations
 __all__ = ["Table", "dataset_tables", "read_csv", "read_parquet", "tensordict_tables"]
 
 import csv
+import json
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from importlib import import_module
@@ -158,15 +159,23 @@ def dataset_tables(folder: Path, system: System) -> list[Table]:
 
     Raises:
         ImportError: Minari is not installed.
-        ValueError: The episodes lack one of the system's columns.
+        ValueError: The folder holds no dataset, or none that says which spaces it has (Minari would
+            make the environment that it names, and so run what is written there), or the episodes
+            lack one of the system's columns.
     """
     try:
         minari = import_module("minari")
     except ImportError:
         hint = "pip install torchrl_bayessim[minari]"
         raise ImportError(message("minari, to read its datasets", "none", hint=hint)) from None
+    _require_spaces(folder)
+    try:
+        episodes = list(minari.MinariDataset(folder / "data"))
+    except Exception as error:  # whatever a loader does with what was made up
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ValueError(message(f"a Minari dataset in {folder.name}", reason)) from None
     tables = []
-    for episode in minari.MinariDataset(folder / "data"):
+    for episode in episodes:
         steps = len(episode.actions)
         arrays = {"actions": episode.actions}
         for name, entry in ("observations", episode.observations), ("infos", episode.infos or {}):
@@ -175,6 +184,18 @@ def dataset_tables(folder: Path, system: System) -> list[Table]:
         arrays["action"] = arrays["actions"]
         tables.append(_table(f"{folder.name}[{episode.id}]", arrays, system))
     return tables
+
+
+def _require_spaces(folder: Path) -> None:
+    expected = f"a Minari dataset in {folder.name} whose metadata.json has its spaces"
+    try:
+        metadata = json.loads((folder / "data" / "metadata.json").read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(message(expected, str(error)[:200])) from None
+    spaces = "observation_space", "action_space"
+    known = metadata if isinstance(metadata, dict) else {}
+    if not all(isinstance(known.get(name), str) for name in spaces):
+        raise ValueError(message(expected, sorted(known)[:20] or type(metadata).__name__))
 
 
 def tensordict_tables(data: TensorDictBase | Path, system: System) -> list[Table]:
