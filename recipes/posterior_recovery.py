@@ -161,7 +161,9 @@ class Laboratory:
 def run(settings: Recovery, name: str, seed: int, folder: Path) -> dict[str, Any]:
     """Return what every method says about one problem with one seed; kept in a file."""
     protocol = "paper" if settings.paper_mode else "own"
-    file = folder / f"{name}_{protocol}_{settings.simulations}_{settings.truths}_{seed}.json"
+    without = "".join(f"_no_{kind}" for kind in ("npe", "online") if not getattr(settings, kind))
+    sizes = f"{settings.simulations}_{settings.truths}"
+    file = folder / f"{name}_{protocol}{without}_{sizes}_{seed}.json"
     return recipe.kept(file, lambda: answered(settings, name, seed))
 
 

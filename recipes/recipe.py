@@ -79,6 +79,8 @@ def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> No
         made = opened(folder)
         if hasattr(settings, "resume"):
             made = [*begun(settings, folder), *made]
+        elif (folder / "checkpoint.pt").exists():
+            raise ValueError(message("out= to be a folder without a run", str(folder)))
         result = job(settings, folder)
     except _EXPECTED as error:
         leave(made)

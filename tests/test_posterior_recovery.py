@@ -81,6 +81,16 @@ def test_a_missing_part_is_run_again_to_the_same_numbers_and_no_other(
     same_numbers(tmp_path / "run", finished[0] / "run")
 
 
+def test_parts_of_other_methods_are_other_parts(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(RECIPE.parent)
+    import posterior_recovery
+
+    monkeypatch.setattr(posterior_recovery, "answered", lambda s, *_: {"online": s.online})
+    for online in (False, True):
+        settings = posterior_recovery.Recovery(online=online)
+        assert posterior_recovery.run(settings, "pendulum", 0, tmp_path) == {"online": online}
+
+
 def test_an_unknown_problem_ends_in_one_line(tmp_path):
     status, _, err = run("problem=pendulumm", folder=tmp_path)
     assert status == 2

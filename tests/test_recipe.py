@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -108,6 +109,21 @@ def test_killed_in_mid_run_it_resumes_to_the_same_files(finished, tmp_path, monk
     assert not (broken / "result.json").exists()
     assert run(case, broken)
     assert differing(read(broken), read(folder)) == []
+
+
+def test_another_recipe_leaves_a_run_alone(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(RECIPE.parent)
+    import posterior_recovery
+    import recipe
+
+    folder = tmp_path / "run"
+    shutil.copytree(finished[0], folder)
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    monkeypatch.setattr(sys, "argv", ["posterior_recovery.py", "short=true", f"out={folder}"])
+    with pytest.raises(SystemExit, match="2"):
+        recipe.main(posterior_recovery.Recovery, posterior_recovery.job)
+    assert "a folder without a run" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
 def test_seeds_are_compared_to_the_same_numbers(finished, same_numbers, tmp_path, monkeypatch):
