@@ -45,6 +45,7 @@ _NEEDED, _LIKELY = 40.0, 6.0
 _EXPLAINED = 0.5  # of the excess of the segments concerned, by what is left of them
 _NOISE = 1.2  # scatter that noise has
 _OTHERS = 1 / 6  # of the segments that something else may have spoiled
+_REMAIN = 0.6  # or of those that were spoiled without losses
 _FEWEST = 4  # segments with a loss
 _LIKELIER = 0.5  # probability that a segment has a loss, or is spoiled
 
@@ -182,14 +183,19 @@ def _found(data: Mapping[str, _Data], unit: Unit, base: LossLaw) -> Chance | Non
     """Return the losses of a unit, nothing if they do not explain what they spoil."""
     tried = {name: one.tried(unit) for name, one in data.items()}
     judged = [tried[name] for name in ("train", "validation")]
-    laws = [replace(base, share=s, spoiled=e) for s, e in product(_SHARES, _SPOILED)]
+    scatters = [s for s in _SCATTER.tolist() if s <= base.scatter][-3:]
+    laws = [LossLaw(*some, base.size) for some in product(_SHARES, scatters, _SPOILED)]
     law = min(laws, key=lambda law: law.deviance(judged))
     gains = [base.deviance([one.without]) - law.deviance([one]) for one in judged]
     if sum(gains) < _NEEDED or gains[1] < -_LIKELY:
         return None
     told = {name: law.told(one) for name, one in tried.items()}
     known = Told.joined([told["train"], told["validation"]])
-    if law.scatter > _NOISE or (known.spoiled > _LIKELIER).mean() > _OTHERS:
+    spoiled = [
+        float((one.spoiled > _LIKELIER).mean())
+        for one in (known, Told.joined([base.told(one.without) for one in judged]))
+    ]
+    if law.scatter > _NOISE or spoiled[0] > max(_OTHERS, _REMAIN * spoiled[1]):
         return None  # something else is wrong everywhere, and may look like this
     concerned = known.lost > _LIKELIER
     excess = [float((one[concerned] - law.scatter).sum()) for one in (known.before, known.after)]

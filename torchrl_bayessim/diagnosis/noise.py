@@ -56,7 +56,7 @@ def measured_noise(
         factor = innovation_noise(fit.innovations, pushed - fit.innovations, len(pieces.checked))
         noise = np.maximum(noise * np.clip(factor, 1 / _AT_ONCE, _AT_ONCE), tiny)
         estimate, noise = noise, np.minimum(noise, _most(noise, given, system.robot))
-        if np.abs(np.log(factor)).max() < _SETTLED:
+        if np.abs(np.log(np.maximum(factor, 1e-9))).max() < _SETTLED:
             break
     apart = [
         f"{name}: {estimate:.3g} against {spec:.3g}"
