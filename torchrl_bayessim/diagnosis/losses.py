@@ -16,6 +16,7 @@ __all__ = ["losses"]
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations, product
 
 import numpy as np
@@ -81,6 +82,14 @@ class _Data:
         squares = np.stack([((self.left + change) ** 2).mean(-1) for change in changes])
         return Tried(squares, np.array([sum(p) for p in patterns]), len(patterns[0]))
 
+    @cached_property
+    def _simulated(self) -> Array:
+        """What all channels would show, shape ``(S, H, C)``."""
+        predictor = self.objective.predictor
+        theta = self.objective.theta(self.point.z[None])
+        qpos, qvel = predictor.states(self.objective.segments, theta)
+        return np.nan_to_num(predictor.sensing.values(qpos[0], qvel[0]))
+
     def _of_commands(self, actuator: int, patterns: Patterns) -> Iterator[Array]:
         """Yield what each pattern of lost commands changes, ``(S, M)``."""
         segments, robot = self.objective.segments, self.objective.predictor.system.robot
@@ -93,18 +102,18 @@ class _Data:
             ctrl[:, at + t, actuator] += nudge[:, 1 + t]
             moved = self.objective.along(replace(segments, ctrl=ctrl))([self.point])[0]
             slopes.append((moved - self.left) / nudge[:, 1 + t, None])
+        every = np.stack(slopes)
         for lost in patterns:
             arrived = sent[:, _last(lost)] - sent[:, 1:]
-            yield np.einsum("st,tsm->sm", arrived, np.stack(slopes))
+            yield np.einsum("st,tsm->sm", arrived, every)
 
     def _of_samples(self, channel: int, patterns: Patterns) -> Iterator[Array]:
         """Yield what each pattern of samples, the start's first, changes, ``(S, M)``."""
         objective, segments = self.objective, self.objective.segments
         predictor, at = objective.predictor, segments.history
         sensing = predictor.sensing
-        qpos, qvel = predictor.states(segments, objective.theta(self.point.z[None]))
         first = sensing.values(segments.qpos[:, at], segments.qvel[:, at])[:, channel]
-        shown = np.c_[first, np.nan_to_num(sensing.values(qpos[0], qvel[0])[..., channel])]
+        shown = np.c_[first, self._simulated[..., channel]]
         # a start that was not renewed is where the robot was a step before
         offsets = np.zeros((1, len(segments), 2 * predictor.tangent.size))
         offsets[0, :, sensing.channels[channel]] = shown[:, 1] - shown[:, 0]
