@@ -180,6 +180,47 @@ def test_units_and_signs(change, kind):
         usable_logs(records, system, findings)
 
 
+@pytest.mark.parametrize("velocities", [True, False])
+@pytest.mark.parametrize(
+    ("factors", "kind", "said"),
+    [
+        ((DEGREES, 1.0), "motion_scale", "in degrees?"),
+        ((0.5 / np.pi, 1.0), "motion_scale", "in turns?"),
+        ((-1.0, 1.0), "motion_sign", "of opposite sign"),
+        ((1.0, 1e-3), "action_scale", "in thousands?"),
+        ((1.0, 0.0), "no_actions", "were actions recorded?"),
+    ],
+)
+def test_one_log_in_other_units_is_named(velocities, factors, kind, said):
+    system, records = simulated("arm")
+    if not velocities:
+        system = System(task=system.task, columns=replace(system.columns, qvel={}))
+    motion, actions = factors
+    changed = times(records[2], factor_q=motion, factor_v=motion, factor_u=actions)
+    records = [*records[:2], changed, *records[3:]]
+    if not velocities:
+        records = [replace(r, qvel=np.full_like(r.qvel, np.nan)) for r in records]
+    findings = check(records, system)
+    (found,) = [f for f in findings if f.severity == "error"]
+    assert (found.file, found.kind) == ("2.csv", kind)
+    assert said in found.message
+
+
+@pytest.mark.parametrize("name", ["arm", "cartpole"])
+def test_a_log_far_from_the_others_is_named(name):
+    findings, *_ = spoilt(lambda r: replace(r, qpos=r.qpos + 1e6), only=2, name=name)
+    found = [f for f in findings if f.kind == "offset"]
+    assert found
+    assert {(f.file, f.severity) for f in found} == {("2.csv", "error")}
+    assert "is 1e+06 from where it is in other logs" in found[0].message
+
+
+def test_two_logs_tell_which_of_them_is_odd():
+    system, records = simulated("arm")
+    findings = check([times(records[0], factor_q=-1, factor_v=-1), records[1]], system)
+    assert {f.file for f in findings if f.severity == "error"} == {"0.csv"}
+
+
 @pytest.mark.parametrize(
     ("change", "kind"),
     [

@@ -23,6 +23,7 @@ from .record import Record, plausible, usable_rows
 from .resampling import resample
 from .system import System
 from .timestamps import check_time
+from .units import check_offsets
 
 
 def check(records: Sequence[Record], system: System, *, horizon: int = 10) -> list[Finding]:
@@ -55,6 +56,7 @@ def check(records: Sequence[Record], system: System, *, horizon: int = 10) -> li
         found += check_channels(record, system)
         found += _missing(record, system)
     found += _copies(records)
+    found += check_offsets(records, system)
     found += _resolution(records, system)
     found += _actions(records, system)
     logs = [_logs(record, system, found) for record in records]
