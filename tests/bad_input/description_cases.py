@@ -51,6 +51,14 @@ def hostile():
         "deep blocks": ("".join(" " * i + "a:\n" for i in range(400)), "robot.yaml"),
         "thousands of keys": (
             SYSTEM.replace("noise: {", "noise: {" + "".join(f"k{i}: 1, " for i in range(8_000))),
+            "more than 5000 keys and values",
+        ),
+        "a list of thousands": (
+            f"{SYSTEM}effects: [{', '.join(f'{i:x}' for i in range(16_000))}]",
+            "more than 5000 keys and values",
+        ),
+        "hundreds of keys": (
+            SYSTEM.replace("noise: {", "noise: {" + "".join(f"k{i}: 1, " for i in range(800))),
             "a channel in noise",
         ),
         "megabytes": ("#" * 5_000_000, "100 kB"),

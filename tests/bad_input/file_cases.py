@@ -111,12 +111,14 @@ def parquets():
     yield spoilt("CSV as Parquet", "Parquet in run2.parquet", lambda p: p.write_text(csv))
     yield Case(name="Parquet as CSV", spoil=lambda f: parquet(one(f)), said="UTF-8")
     yield spoilt("bytes changed", "run2.parquet", _garbled)
+    yield spoilt("a name that is no text", "numbers in Parquet in run2.parquet", _misnamed)
     words = ["fast"] * len(rows(2))
     others = {
         "words": (words, "numbers in Parquet in run2.parquet"),
         "lists": ([[1.0, 2.0]] * len(words), "numbers in Parquet in run2.parquet"),
         "maps": ([{"x": 1.0}] * len(words), "numbers in Parquet in run2.parquet"),
         "bytes": ([b"\x00\xff"] * len(words), "numbers in Parquet in run2.parquet"),
+        "truths": ([True] * len(words), "numbers in column 'q' of run2.parquet, got 'booleans'"),
     }
     for name, (value, said) in others.items():
         yield spoilt(f"Parquet of {name}", said, lambda p, value=value: parquet(p, q=value))
@@ -135,6 +137,11 @@ def _garbled(path):
     data = bytearray(path.read_bytes())
     data[100:1100] = bytes(1000)
     path.write_bytes(data)
+
+
+def _misnamed(path):
+    parquet(path)
+    path.write_bytes(path.read_bytes().replace(b"tau", b"\xe9au"))
 
 
 def _without(path, name):
@@ -231,6 +238,12 @@ def tensordicts():
 
         return change
 
+    actions = torch.ones(RUNS, len(rows(0)), dtype=torch.bool)
+    yield spoilt(
+        "of truths",
+        lambda f: TensorDict.load_memmap(f).clone().set("tau", actions).memmap(f),
+        "numbers in column 'tau' of logs[0], got 'booleans'",
+    )
     yield spoilt("cut", lambda f: os.truncate(f / "q.memmap", 1000))
     linked = lambda f: ((f / "q.memmap").rename(f / "r"), (f / "q.memmap").symlink_to("r"))
     yield spoilt("with a link", linked)

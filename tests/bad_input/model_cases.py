@@ -202,6 +202,16 @@ def broken():
     yield Case(name="XML of a place NaN", spoil=nowhere, said="robot.xml")
 
 
+def endless():
+    """Ask for simulations that would not end."""
+    step = swap('timestep="0.005"', 'timestep="1e-12"', file="robot.xml")
+    yield Case(name="XML of tiny steps", spoil=step, said="at most 10000 time steps in a control")
+    for name in "iterations", "ls_iterations", "noslip_iterations", "ccd_iterations":
+        endless = swap("<option", f'<option {name}="1000000000"', file="robot.xml")
+        said = f"{name} of at most 10000 in the <option> of robot.xml, got 1000000000"
+        yield Case(name=f"XML of many {name}", spoil=endless, said=said)
+
+
 def bombs():
     """Ask for more than a machine has."""
     body = "<geom size='.1'/>"
@@ -250,5 +260,6 @@ CASES = [
     *namespaces(),
     *backslashes(),
     *broken(),
+    *endless(),
     *bombs(),
 ]

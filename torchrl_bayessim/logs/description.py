@@ -21,8 +21,12 @@ class _Loader(yaml.SafeLoader):
     """Knows text, lists and mappings only."""
 
     yaml_implicit_resolvers: dict = {}  # noqa: RUF012 (as the base class has it)
+    _nodes = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
+        self._nodes += 1
+        if self._nodes > _MOST:
+            raise yaml.YAMLError(f"more than {_MOST} keys and values")
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("an alias (*name)")
         return super().compose_node(parent, index)
@@ -44,13 +48,15 @@ _Loader.yaml_constructors = {  # of SafeLoader's, without its numbers, dates, se
     if tag in {None, *(f"tag:yaml.org,2002:{name}" for name in ("str", "seq", "map"))}
 }
 _LARGEST = 100_000  # bytes
+_MOST = 5_000  # keys and values
 
 
 def read_description(path: Path) -> Description:
     """Return a YAML file's contents.
 
     Raises:
-        ValueError: There is no such file, or it is not plain YAML in UTF-8 of at most 100 kB.
+        ValueError: There is no such file, or it is not plain YAML in UTF-8 of at most 100 kB and
+            5,000 keys and values.
     """
     try:
         if path.exists() and not path.is_file():  # a pipe or a device has no end

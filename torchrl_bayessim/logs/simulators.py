@@ -61,9 +61,13 @@ def at_control_step(task: Task, control_dt: float) -> Task:
     """Return the task with as many time steps per control step as ``control_dt`` has.
 
     Raises:
-        ValueError: That is not a whole number of at least one.
+        ValueError: That is not a whole number from 1 to 10,000.
     """
     timestep = task.model.opt.timestep
+    if timestep > 0 and control_dt < 1e6 and control_dt > _MOST_STEPS * timestep:
+        expected = f"at most {_MOST_STEPS} time steps in a control step of {control_dt:g} s"
+        hint = "a larger <option timestep>, or a smaller control_dt"
+        raise ValueError(message(expected, f"a time step of {timestep:g} s", hint=hint))
     steps = round(control_dt / timestep) if 0 < control_dt < 1e6 and timestep > 0 else 0
     if steps < 1 or abs(steps * timestep - control_dt) > 1e-6 * control_dt:
         hint = "change the model's <option timestep> or control_dt"
@@ -98,6 +102,7 @@ def _compiled(folder: Path, name: str) -> mujoco.MjModel:
         reason = " ".join(str(error).split())
         raise ValueError(message(f"an MJCF file that compiles in {name}", reason)) from None
     _check_numbers(model, name)
+    _check_iterations(model, name)
     return model
 
 
@@ -115,4 +120,15 @@ def _check_numbers(model: mujoco.MjModel, name: str) -> None:
                     raise ValueError(message(expected, got))
 
 
+def _check_iterations(model: mujoco.MjModel, name: str) -> None:
+    """Raise a ValueError if a solver may go on for what would not end."""
+    kinds = "", "ls_", "noslip_", "ccd_", "sdf_"
+    for key in (f"{kind}iterations" for kind in kinds):
+        value = getattr(model.opt, key)
+        if value > _MOST_STEPS:
+            expected = f"{key} of at most {_MOST_STEPS} in the <option> of {name}"
+            raise ValueError(message(expected, value))
+
+
 _LARGEST = 1e15
+_MOST_STEPS = 10_000  # of time in a control step, and of a solver in a time step

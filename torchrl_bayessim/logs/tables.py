@@ -146,9 +146,12 @@ def read_parquet(path: Path, names: list[str]) -> Table:
         table = parquet.read_table(path, columns=names)
         columns = {}
         for name in names:
-            column = table[name].combine_chunks().cast(pyarrow.float64())
+            column = table[name].combine_chunks()
+            if column.type == pyarrow.bool_():
+                raise _no_number(name, path.name)
+            column = column.cast(pyarrow.float64())
             columns[name] = np.array(column.fill_null(np.nan).to_numpy(zero_copy_only=False))
-    except (pyarrow.ArrowException, OSError) as error:
+    except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:  # names are text
         reason = " ".join(str(error).split())[:200]
         raise ValueError(message(f"numbers in Parquet in {path.name}", reason)) from None
     return Table(path.name, columns)
@@ -225,13 +228,17 @@ def tensordict_tables(data: TensorDictBase | Path, system: System) -> list[Table
             if begin < end:
                 part = row[begin:end]
                 arrays = {
-                    ".".join((key,) if isinstance(key, str) else key): value.double().numpy()
+                    ".".join((key,) if isinstance(key, str) else key): _array(value)
                     for key, value in part.items(include_nested=True, leaves_only=True)
                     if isinstance(value, torch.Tensor) and not value.is_complex()
                 }
                 label = f"{name}[{len(tables)}]"
                 tables.append(_table(label, arrays, system))
     return tables
+
+
+def _array(value: torch.Tensor) -> NDArray[Any]:
+    return value.numpy() if value.dtype == torch.bool else value.double().numpy()
 
 
 def _leaves(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
@@ -244,11 +251,11 @@ def _leaves(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
 
 
 def _table(name: str, arrays: Mapping[str, NDArray[Any]], system: System) -> Table:
-    columns: dict[str, Array] = {}
+    columns: dict[str, NDArray[Any]] = {}
     for key, value in arrays.items():
         if not (np.issubdtype(value.dtype, np.number) or value.dtype == bool) or value.ndim < 1:
             continue
-        flat = value.reshape(len(value), -1).astype(np.float64)
+        flat = value.reshape(len(value), -1)
         columns |= {f"{key}[{i}]": flat[:, i] for i in range(flat.shape[1])}
         if value.ndim == 1 or flat.shape[1] == 1:
             columns[key] = flat[:, 0]
@@ -260,10 +267,12 @@ def _table(name: str, arrays: Mapping[str, NDArray[Any]], system: System) -> Tab
         length = len(next(iter(arrays.values())))
         columns[time] = system.control_dt * np.arange(length, dtype=np.float64)
     _check_names(names, list(columns), name)
-    return Table(name, {key: columns[key] for key in names})
+    if truths := [key for key in names if columns[key].dtype == bool]:
+        raise _no_number(truths[0], name)
+    return Table(name, {key: columns[key].astype(np.float64) for key in names})
 
 
-def _by_joint(key: str, flat: Array, model: mujoco.MjModel) -> dict[str, Array]:
+def _by_joint(key: str, flat: NDArray[Any], model: mujoco.MjModel) -> dict[str, NDArray[Any]]:
     columns = default_columns(model)
     names = {
         "qpos": [n for group in columns.qpos.values() for n in group],
@@ -272,6 +281,12 @@ def _by_joint(key: str, flat: Array, model: mujoco.MjModel) -> dict[str, Array]:
         "action": list(columns.ctrl.values()),
     }.get(key, [])
     return dict(zip(names, flat.T, strict=True)) if len(names) == flat.shape[1] else {}
+
+
+def _no_number(column: str, file: str) -> ValueError:
+    """Return the error for truth values: nobody knows how much they are in the model's units."""
+    hint = "what was measured or commanded, in the units of the model"
+    return ValueError(message(f"numbers in column {column!r} of {file}", "booleans", hint=hint))
 
 
 def _check_count(rows: int, file: str) -> None:
