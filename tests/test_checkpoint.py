@@ -127,6 +127,15 @@ def test_whatever_byte_is_altered_the_state_is_whole_or_refused_in_words(file):
     assert [text for text in said if not text.startswith(known)] == []
 
 
+def test_an_archive_with_two_parts_of_one_name_is_refused(file):
+    save(file, {"x": torch.arange(8.0), "y": torch.zeros(8)})
+    data = file.read_bytes()
+    assert data.count(b"data/1") == 2  # in its header, and in the directory
+    file.write_bytes(data.replace(b"data/1", b"data/0"))
+    with pytest.raises(ValueError, match="a whole checkpoint written by this package"):
+        load(file)
+
+
 def test_foreign_files_are_refused(file):
     file.write_text("time,q\n0,1\n")
     with pytest.raises(ValueError, match="whole checkpoint"):

@@ -91,10 +91,12 @@ def _verified(data: bytes) -> io.BytesIO:
     `torch.load` verifies none, and finds tensors by headers, in which one wrong byte moves them.
 
     Raises:
-        zipfile.BadZipFile: A checksum is wrong.
+        zipfile.BadZipFile: A checksum is wrong, or two parts have one name.
     """
     whole = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(data)) as damaged, zipfile.ZipFile(whole, "w") as archive:
+        if len(set(damaged.namelist())) < len(damaged.namelist()):
+            raise zipfile.BadZipFile("two parts of one name")
         for name in damaged.namelist():
             archive.writestr(zipfile.ZipInfo(name), damaged.read(name))
     whole.seek(0)
