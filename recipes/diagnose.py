@@ -3,8 +3,10 @@
     python recipes/diagnose.py system=robot.yaml data=logs/ out=report/
 
 Reads the description of the robot and its logs, checks whether the logs can be believed, and says
-where the gap lies, which effect causes it and how far it shrinks. Writes report.html (one file),
-report.json and result.json; the last line but one is the verdict in a sentence.
+where the gap lies, which effect causes it and how far it shrinks. Malformed logs are refused, in
+one message that names all that is wrong with them; spoilt=leave_out goes on without those parts.
+Writes report.html (one file), report.json and result.json; the last line but one is the verdict in
+a sentence.
 """
 
 from __future__ import annotations
@@ -22,10 +24,11 @@ from tqdm import tqdm
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.page import write_page
 from torchrl_bayessim.errors import message
+from torchrl_bayessim.kinds import check_choice
 from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.read import read_records
 from torchrl_bayessim.logs.record import Record
-from torchrl_bayessim.logs.sanity import Finding, check, usable_logs
+from torchrl_bayessim.logs.sanity import Finding, check, refuse_spoilt, usable_logs
 from torchrl_bayessim.logs.system import System
 
 STAGES = 6  # of a search that ends after one round
@@ -39,6 +42,7 @@ class Diagnosis(recipe.Settings):
 
     system: str = ""  # system.yaml
     data: str = ""  # a folder of CSV or Parquet files, a Minari dataset, a saved TensorDict
+    spoilt: str = "refuse"  # malformed logs, or leave_out: go on without the rows that are named
     leave_out: str = ""  # logs whose names contain one of these, with commas between them
     effects: str = ""  # names with commas between them; the system's own by default
     mode: str = ""  # segments, trajectories, or summaries where clocks are not synchronised
@@ -73,6 +77,7 @@ def read(settings: Diagnosis) -> tuple[System, list[Log], list[Finding]]:
     for name in ("system", "data"):
         if not getattr(settings, name):
             raise ValueError(message(f"{name}=PATH", "none"))
+    check_choice("spoilt", settings.spoilt, ("refuse", "leave_out"))
     if settings.horizon < 0:
         raise ValueError(message("a horizon of 1 or more, or 0 to choose one", settings.horizon))
     if settings.horizon > LONGEST:
@@ -80,6 +85,8 @@ def read(settings: Diagnosis) -> tuple[System, list[Log], list[Finding]]:
     system = System.load(settings.system)
     records = kept(read_records(settings.data, system), settings.leave_out)
     findings = check(records, system, horizon=settings.horizon or SHORTEST)
+    if settings.spoilt == "refuse":
+        refuse_spoilt(findings)
     for finding in findings:
         print(finding)
     return system, usable_logs(records, system, findings), findings

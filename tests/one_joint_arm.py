@@ -39,8 +39,8 @@ FEW = ["effects=coulomb_friction,action_bias,action_gain", "horizon=20", "progre
 FRICTION = 0.15  # N m
 
 
-def motion(seed, *, rows=160, friction=0.0, amplitude=0.6):
-    """Return rows t, q, qd, tau of an arm that is driven by a sum of sines."""
+def motion(seed, *, rows=160, friction=0.0, amplitude=0.6, push=0.0):
+    """Return rows t, q, qd, tau of an arm that is driven by a sum of sines, and pushed once."""
     generator = np.random.default_rng(seed)
     model = mujoco.MjModel.from_xml_string(ARM)
     model.dof_frictionloss[:] = friction
@@ -54,6 +54,7 @@ def motion(seed, *, rows=160, friction=0.0, amplitude=0.6):
         noise = generator.standard_normal(2) * (0.001, 0.02)
         found.append([0.01 * k, q + noise[0], qd + noise[1], torque])
         data.ctrl[0] = torque
+        data.qfrc_applied[0] = push if 80 <= k < 90 else 0.0
         mujoco.mj_step(model, data, 2)
     return found
 

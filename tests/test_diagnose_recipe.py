@@ -82,12 +82,38 @@ def test_what_the_gate_finds_is_printed_and_in_the_report(finished, tmp_path):
         if run == 2:
             rows[40][1] = float("nan")
         save(tmp_path / f"logs/run{run}.csv", rows)
-    printed = diagnose(tmp_path)
+    printed = diagnose(tmp_path, "spoilt=leave_out")
     finding = "warning: run2.csv rows 40 to 40: 1 row(s) with values that are missing"
     assert finding in printed
     report = json.loads((tmp_path / "report/report.json").read_text())
     assert any(alarm.startswith(finding) for alarm in report["alarms"])
     assert report["verdict"] == "none"
+
+
+def test_malformed_logs_end_in_one_message_that_names_all_of_it(refused, tmp_path):
+    for run in range(4):
+        rows = np.array(motion(run))
+        if run == 1:
+            rows[40, 1] = np.nan
+        if run in {0, 2}:
+            rows[:, 0] *= 1e3
+        save(tmp_path / f"logs/run{run}.csv", rows.tolist())
+    line = refused()
+    assert (
+        "run1.csv rows 40 to 40: 1 row(s) with values that are missing or beyond 1e8 (missing)"
+        in line
+    )
+    assert "run0.csv rows 0 to 159: rows are 10 s apart" in line
+    assert "(time_unit; so run2.csv)" in line
+    assert "spoilt=leave_out" in line
+
+
+def test_a_push_is_no_fault_of_the_logs(tmp_path):
+    describe(tmp_path)
+    for run in range(4):
+        rows = motion(run, push=9.0 if run == 1 else 0.0)
+        save(tmp_path / f"logs/run{run}.csv", rows)
+    assert "hinge is pushed by more than" in diagnose(tmp_path)
 
 
 def test_a_single_trajectory_gives_an_alarm_and_no_confident_verdict(tmp_path):
@@ -137,6 +163,7 @@ def refused(tmp_path, capsys):
         ("horizon=-1", "expected a horizon of 1 or more, or 0 to choose one, got -1"),
         ("horizon=200", "160 control steps in succession can be used, 201 are needed"),
         ("leave_out=run7", "a part of a log's name to leave out, got 'run7'. Available: run0.csv"),
+        ("spoilt=keep", "spoilt, got 'keep'. Available: refuse, leave_out"),
         ("leave_out=run", "expected logs beside those left out, got 'none'"),
         ("sytem=robot.yaml", "system (did you mean this?)"),
     ],

@@ -8,6 +8,10 @@ from pathlib import Path
 from one_joint_arm import motion, save
 
 RUNS, ROWS = 4, 160
+ALARMS = {  # what the gate finds with which a report is honest
+    *("gap", "coarse_time", "fine_time", "jitter"),
+    *("resolution", "constant_action", "constant_channel"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +24,8 @@ class Case:
         name: Of the test.
         spoil: Spoils the folder.
         said: Part of the one message with which the diagnosis refuses it.
-        found: What the sanity gate says, as ``"kind"`` (of all logs) or ``"run2.csv kind"``.
+        found: What the sanity gate says, as ``"kind"`` (of all logs) or ``"run2.csv kind"``: in an
+            alarm of the report if it is one of `ALARMS`, in the refusal otherwise.
         arguments: Of the command line.
     """
 
@@ -29,6 +34,11 @@ class Case:
     said: str = ""
     found: tuple[str, ...] = ()
     arguments: tuple[str, ...] = ()
+
+    @property
+    def kind(self) -> str:
+        """The kind of what is found."""
+        return self.found[-1].rpartition(" ")[2] if self.found else ""
 
 
 @cache

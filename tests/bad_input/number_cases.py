@@ -2,7 +2,7 @@
 
 import numpy as np
 from case import ROWS, RUNS, Case, rows
-from one_joint_arm import save
+from one_joint_arm import SYSTEM, save
 
 T, Q, V, U = range(4)
 NAMES = ("t", "q", "qd", "tau")
@@ -86,7 +86,7 @@ def times():
         "infinite times": (assign(slice(50, 60), T, np.inf), "run2.csv not_finite_time"),
         "a time of NaN": (assign(slice(50, 51), T, np.nan), "run2.csv not_finite_time"),
         "a gap": (lambda a: np.delete(a, slice(60, 80), axis=0), "run2.csv gap"),
-        "many gaps": (lambda a: a[(np.arange(ROWS) % 20) < 15], "run2.csv gap"),
+        "many gaps": (lambda a: a[(np.arange(ROWS) % 20) < 15], "run2.csv short"),
         "a huge time": (assign(slice(ROWS - 1, None), T, 1e300), "run2.csv not_finite_time"),
         "a huge time within": (assign(slice(80, 81), T, 1e300), "run2.csv not_finite_time"),
         "a time as of an epoch": (assign(slice(90, None), T, 1.7e9), "run2.csv repeated_time"),
@@ -104,6 +104,8 @@ def times():
         }:
             yield refused(f"{name} in all", every(edit), "logs that can be used")
     yield refused("rows a day apart", every(scale(T, 8.64e6)), "logs that can be used")
+    coarse = lambda f: (f / "robot.yaml").write_text(SYSTEM.replace("dt: 0.01", "dt: 0.05"))
+    yield found("a control step of five rows", coarse, "run2.csv fine_time")
     for unit, factor in ("ms", 1e3), ("us", 1e6), ("ns", 1e9):
         yield found(f"one log in {unit}", change(scale(T, factor)), "run2.csv time_unit")
         yield refused(f"all logs in {unit}", every(scale(T, factor)), "seconds?")
@@ -126,6 +128,18 @@ def units():
         kind = "velocity_sign" if "sign" in said else "velocity_scale"
         yield found(f"one log with {name}", change(edit), f"run2.csv {kind}")
         yield refused(f"all logs with {name}", every(edit), said)
+    whole = slice(Q, V + 1)
+    alone = {
+        "q and qd in degrees": (scale(whole, degree), "motion_scale"),
+        "q and qd in turns": (scale(whole, 0.5 / np.pi), "motion_scale"),
+        "q and qd of opposite sign": (scale(whole, -1), "motion_sign"),
+        "tau of opposite sign": (scale(U, -1), "motion_sign"),  # which looks the same
+        "tau in N mm": (scale(U, 1e3), "action_scale"),
+        "no tau": (scale(U, 0), "no_actions"),
+        "q far away": (lambda a: np.add(a, [0, 1e6, 0, 0]), "offset"),
+    }
+    for name, (edit, kind) in alone.items():
+        yield found(f"one log with {name}", change(edit), f"run2.csv {kind}")
     yield refused("tau of opposite sign", every(scale(U, -1)), "opposite sign")
     yield found("tau in N mm", every(scale(U, 1e3)), "action_scale")
     yield found("tau in kN m", every(scale(U, 1e-3)), "action_scale")
@@ -134,7 +148,7 @@ def units():
 
 def constants():
     """Log channels that stand still, or one in place of another."""
-    kinds = {Q: "frozen", V: "velocity_mismatch", U: "constant_action"}
+    kinds = {Q: "frozen", V: "velocity_mismatch", U: "no_actions"}
     for column, kind in kinds.items():
         name = f"{NAMES[column]} of one log stands still"
         yield found(name, change(assign(slice(None), column, 0.25)), f"run2.csv {kind}")

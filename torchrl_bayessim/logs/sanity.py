@@ -7,9 +7,10 @@ wrong (friction, gains, delays, noise) is no error here: that is what a diagnosi
 
 from __future__ import annotations
 
-__all__ = ["check", "usable_logs"]
+__all__ = ["check", "refuse_spoilt", "usable_logs"]
 
 from collections.abc import Iterator, Sequence
+from itertools import groupby
 
 import numpy as np
 
@@ -24,6 +25,9 @@ from .resampling import resample
 from .system import System
 from .timestamps import check_time
 from .units import check_offsets
+
+_HONEST = {"push"}  # errors that happen to a robot, whose logs are as they should be
+_MALFORMED = {"missing", "action_scale", "effort"}  # warnings of which that is not so
 
 
 def check(records: Sequence[Record], system: System, *, horizon: int = 10) -> list[Finding]:
@@ -72,6 +76,31 @@ def check(records: Sequence[Record], system: System, *, horizon: int = 10) -> li
     return sorted(found, key=lambda finding: finding.severity != "error")
 
 
+def refuse_spoilt(findings: Sequence[Finding]) -> None:
+    """Refuse logs that are malformed: every error but a push, missing values, and odd units.
+
+    Raises:
+        ValueError: There are such findings; it names all of them, those of a kind together.
+    """
+    spoilt = [
+        finding
+        for finding in findings
+        if finding.kind in _MALFORMED
+        or (finding.severity == "error" and finding.kind not in _HONEST)
+    ]
+    texts = []
+    for kind, alike in groupby(sorted(spoilt, key=lambda one: one.kind), lambda one: one.kind):
+        first, *rest = alike
+        files = list(dict.fromkeys(one.file for one in rest if one.file != first.file))
+        more = f"; {len(files) - 4} more files" if len(files) > 4 else ""
+        also = f"; so {', '.join(files[:4])}{more}" if files else ""
+        place = f"{first.file} rows {first.rows[0]} to {first.rows[1]}: " if first.file else ""
+        texts.append(f"{place}{first.message} ({kind}{also})")
+    if texts:
+        hint = "mend them, leave them out, or go on without what is named: spoilt=leave_out"
+        raise ValueError(message("logs that can be used", " | ".join(texts), hint=hint))
+
+
 def usable_logs(
     records: Sequence[Record], system: System, findings: Sequence[Finding]
 ) -> list[Log]:
@@ -109,7 +138,7 @@ def _missing(record: Record, system: System) -> Iterator[Finding]:
     """Find rows with values that are missing."""
     rows = np.flatnonzero(~usable_rows(record, system))
     if len(rows):
-        text = f"{len(rows)} row(s) with values that are missing or beyond 1e8, left out"
+        text = f"{len(rows)} row(s) with values that are missing or beyond 1e8"
         place = int(rows[0]), int(rows[-1])
         yield Finding(kind="missing", file=record.name, rows=place, message=text)
 

@@ -42,6 +42,15 @@ def check_time(record: Record, control_dt: float) -> Iterator[Finding]:
             "states between them are interpolated"
         )
         yield Finding(kind="coarse_time", file=record.name, rows=(0, last), message=text)
+    actions = record.ctrl[rows]
+    changes = int((actions[1:] != actions[:-1]).any(1).sum())
+    often = (time[rows[-1]] - time[rows[0]]) / max(changes, 1)
+    if usual < control_dt / 1.5 and often < control_dt / 1.5:
+        text = (
+            f"actions change every {often:.2g} s, more often than once in the control step of "
+            f"{control_dt:.4g} s, and are averaged over it: is control_dt right?"
+        )
+        yield Finding(kind="fine_time", file=record.name, rows=(0, last), message=text)
     gaps = np.flatnonzero(steps > 2.5 * max(usual, control_dt))
     if len(gaps):
         longest = steps[gaps].max()
