@@ -22,7 +22,7 @@ import recipe
 from tqdm import tqdm
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
-from torchrl_bayessim.diagnosis.page import write_page
+from torchrl_bayessim.diagnosis.page import page
 from torchrl_bayessim.errors import message
 from torchrl_bayessim.kinds import check_choice
 from torchrl_bayessim.logs.log import Log
@@ -30,6 +30,7 @@ from torchrl_bayessim.logs.read import read_records
 from torchrl_bayessim.logs.record import Record
 from torchrl_bayessim.logs.sanity import Finding, check, refuse_spoilt, usable_logs
 from torchrl_bayessim.logs.system import System
+from torchrl_bayessim.whole_file import write_texts
 
 STAGES = 6  # of a search that ends after one round
 SHORTEST = 10  # control steps that a log must have where no horizon is given
@@ -65,11 +66,11 @@ def job(settings: Diagnosis, out: Path) -> dict[str, Any]:
             seed=settings.seed,
             progress=progress,
         )
-    report.to_json(out / "report.json")
-    write_page(report, out / "report.html")
+    text = report.as_json()
+    write_texts({out / "report.json": text, out / "report.html": page(report)})
     print(f"The page is {out / 'report.html'}")
     print(report.summary)
-    return json.loads((out / "report.json").read_text(encoding="utf-8"))
+    return json.loads(text)
 
 
 def read(settings: Diagnosis) -> tuple[System, list[Log], list[Finding]]:

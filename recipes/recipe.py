@@ -27,7 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from torchrl_bayessim.errors import BayesSimError, message
-from torchrl_bayessim.whole_file import replacing, write_text
+from torchrl_bayessim.whole_file import replacing, write_text, write_texts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,11 +77,13 @@ def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> No
         torch.set_num_threads(settings.threads)
         folder = Path(settings.out or f"outputs/{name}/{datetime.now():%Y-%m-%d_%H-%M-%S}")
         made = opened(folder)
-        if hasattr(settings, "resume"):
-            made = [*begun(settings, folder), *made]
-        elif (folder / "checkpoint.pt").exists():
-            raise ValueError(message("out= to be a folder without a run", str(folder)))
+        made = [*begun(settings, folder), *made]
         result = job(settings, folder)
+        result["provenance"] = provenance(settings, seconds=time.monotonic() - start)
+        text = json.dumps(plain(result))
+        write_texts(
+            {folder / "settings.json": noted(settings), folder / "result.json": f"{text}\n"}
+        )
     except _EXPECTED as error:
         leave(made)
         if debugging(sys.argv[1:]):
@@ -92,10 +94,6 @@ def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> No
     except KeyboardInterrupt:
         print(f"{name}: stopped; resume=FOLDER goes on where a recipe has it", file=sys.stderr)
         raise SystemExit(130) from None
-    note(settings, folder)
-    result["provenance"] = provenance(settings, seconds=time.monotonic() - start)
-    text = json.dumps(plain(result))
-    write_text(folder / "result.json", text + "\n")
     print(f"RESULT {text}")
 
 
@@ -119,17 +117,16 @@ def begun(settings: Settings, folder: Path) -> list[Path]:
     """Note the settings of a run that can be resumed; return the file if it is new.
 
     Raises:
-        ValueError: The folder holds another run.
+        ValueError: The folder holds another run that can be resumed.
     """
-    path = folder / "settings.json"
-    if getattr(settings, "resume", ""):
-        note(settings, folder)
-        return []
-    if path.exists() or (folder / "checkpoint.pt").exists():
+    path, resumable = folder / "settings.json", hasattr(settings, "resume")
+    going_on = bool(getattr(settings, "resume", ""))
+    if not going_on and ((folder / "checkpoint.pt").exists() or (resumable and path.exists())):
         hint = f"another out=, or resume={folder} to go on with that run"
         raise ValueError(message("out= to be a folder without a run", str(folder), hint=hint))
-    note(settings, folder)
-    return [path]
+    if resumable:
+        write_text(path, noted(settings))
+    return [path] if resumable and not going_on else []
 
 
 def leave(made: list[Path]) -> None:
@@ -152,9 +149,9 @@ def debugging(arguments: list[str]) -> bool:
     return bool(values) and values[-1] in {"true", "yes", "on", "1"}
 
 
-def note(settings: Settings, folder: Path) -> None:
-    """Write the settings into the folder of a run."""
-    write_text(folder / "settings.json", json.dumps(dataclasses.asdict(settings)) + "\n")
+def noted(settings: Settings) -> str:
+    """Return the settings as the folder of a run keeps them."""
+    return json.dumps(dataclasses.asdict(settings)) + "\n"
 
 
 def parse(settings_type: type[S], arguments: list[str]) -> S:

@@ -146,7 +146,7 @@ def refused(tmp_path, capsys):
         with pytest.raises(SystemExit, match="2"):
             diagnose(tmp_path, *arguments)
         (line,) = capsys.readouterr().err.splitlines()
-        assert not (tmp_path / "report/report.json").exists()
+        assert not (tmp_path / "report/result.json").is_file()
         return line
 
     return refuse
@@ -206,6 +206,15 @@ def test_a_wrong_description_is_explained(change, said, refused, tmp_path):
 def test_a_malformed_log_is_explained(rows, said, refused, tmp_path):
     save(tmp_path / "logs/run0.csv", rows)
     assert said in refused()
+
+
+@pytest.mark.parametrize("name", ["report.html", "report.json", "result.json", "settings.json"])
+def test_what_cannot_be_written_is_said_and_nothing_is_half_written(name, refused, tmp_path):
+    (tmp_path / "report" / name).mkdir(parents=True)
+    assert f"expected a file to write, got '{tmp_path}/report/{name}" in refused()
+    left = {path.name for path in (tmp_path / "report").iterdir()}
+    whole = {"report.html", "report.json"} if name.startswith(("result", "settings")) else set()
+    assert left == {name} | whole
 
 
 def test_an_empty_folder_is_explained(refused, tmp_path):

@@ -5,12 +5,13 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-from torchrl_bayessim.whole_file import replacing, replacing_folder, write_text
+from torchrl_bayessim.whole_file import replacing, replacing_folder, write_text, write_texts
 
 ENDS = f"import os; os.kill(os.getpid(), {int(signal.SIGKILL)})"
 HALF = """
@@ -59,17 +60,44 @@ def test_what_a_killed_writer_left_is_removed_by_the_next(file):
     assert left.read_bytes() == b"half"
     assert file.read_text() == "old"
     writer = left.name.removeprefix(".table.md.").removesuffix(".tmp")
-    machine, _, ended = writer.rpartition(".")
+    machine, ended, token = writer.rsplit(".", 2)
     assert machine
-    stay = [f".other.md.{writer}", f".table.md.{machine}.{os.getppid()}"]
-    stay += [f".table.md.elsewhere.{ended}", f".table.md.{machine}.5.{writer}"]
+    stay = [f".other.md.{writer}", f".table.md.{machine}.{os.getppid()}.{token}"]
+    stay += [f".table.md.elsewhere.{ended}.{token}", f".table.md.{machine}.5.{writer}"]
+    stay += [f".table.md.{machine}.{os.getpid()}.{token}", f".table.md.{machine}.{ended}"]
     stay = {left.with_name(f"{name}.tmp") for name in stay}
-    own = left.with_name(f".table.md.{machine}.{os.getpid()}.tmp")
-    for path in (*stay, own):
+    for path in stay:
         path.write_text("of another file, machine, or of a writer that runs")
     write_text(file, "new")
     assert file.read_text() == "new"
     assert set(file.parent.iterdir()) == {file, *stay}
+
+
+def test_writers_of_one_file_in_one_process_do_not_meet(file):
+    with replacing(file) as first:
+        first.write(b"first")
+        with replacing(file) as second:
+            second.write(b"second")
+        assert file.read_bytes() == b"second"
+    assert file.read_bytes() == b"first"
+    assert list(file.parent.iterdir()) == [file]
+
+
+def test_many_threads_write_one_file(file):
+    texts = [str(number) * 50_000 for number in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda text: [write_text(file, text) for _ in range(5)], texts))
+    assert file.read_text() in texts
+    assert list(file.parent.iterdir()) == [file]
+
+
+def test_texts_are_all_written_or_none(file):
+    write_texts({file: "old", file.with_name("page"): "old"})
+    file.with_name("folder").mkdir()
+    with pytest.raises(IsADirectoryError, match=r"a file to write, got '.*folder, which is a"):
+        write_texts({file: "new", file.with_name("page"): "new", file.with_name("folder"): "new"})
+    assert [path.read_text() for path in (file, file.with_name("page"))] == ["old", "old"]
+    assert len(list(file.parent.iterdir())) == 3
 
 
 def test_data_are_forced_to_disk_before_the_rename_and_the_folder_after(file, monkeypatch):

@@ -5,21 +5,31 @@ Whoever reads the target sees the old content or the new one, also after a kill 
 
 from __future__ import annotations
 
-__all__ = ["replacing", "replacing_folder", "write_text"]
+__all__ = ["replacing", "replacing_folder", "write_text", "write_texts"]
 
 import os
 import platform
+import secrets
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from glob import escape
 from pathlib import Path
 from typing import BinaryIO
 
 from .errors import message
 
+
+def _machine() -> str:
+    """Return a name of where process numbers are unique: a host, or a container on it."""
+    numbers = ""
+    with suppress(OSError):  # Linux only
+        numbers = "-" + os.readlink("/proc/self/ns/pid").strip("pid:[]")
+    return (platform.node().replace(os.sep, "-") or "unnamed") + numbers
+
+
 # On a shared file system others write too, whose processes have numbers of their own
-_MACHINE = platform.node().replace(os.sep, "-") or "unnamed"
+_MACHINE = _machine()
 
 
 @contextmanager
@@ -46,11 +56,13 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         b'half'
     """
     path = Path(path).absolute()
+    if path.is_dir():  # said before anything is written
+        raise IsADirectoryError(message("a file to write", f"{path}, which is a folder"))
     path.parent.mkdir(parents=True, exist_ok=True)
     _sweep(path)
     temporary = _beside(path)
     try:
-        with temporary.open("wb") as file:
+        with temporary.open("xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -75,6 +87,27 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """
     with replacing(path) as file:
         file.write(text.encode())
+
+
+def write_texts(texts: Mapping[Path, str]) -> None:
+    """Write texts to their files in UTF-8: none takes its place before all are on disk.
+
+    Raises:
+        OSError: One cannot be written; what was there before stays, of the others too.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> (folder / "page.html").mkdir()
+        >>> write_texts({folder / "page.json": "{}", folder / "page.html": "<p>"})
+        Traceback (most recent call last):
+        IsADirectoryError: expected a file to write, got '.../page.html, which is a folder'.
+        >>> [path.name for path in folder.iterdir()]
+        ['page.html']
+    """
+    with ExitStack() as files:
+        for path, text in texts.items():
+            files.enter_context(replacing(path)).write(text.encode())
 
 
 @contextmanager
@@ -118,8 +151,8 @@ def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _beside(path: Path) -> Path:
-    """Return where this process writes what is to become ``path``."""
-    return path.with_name(f".{path.name}.{_MACHINE}.{os.getpid()}.tmp")
+    """Return where this process writes what is to become ``path``, each time another place."""
+    return path.with_name(f".{path.name}.{_MACHINE}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
 
 
 def _sync(file: Path) -> None:
@@ -131,8 +164,8 @@ def _sync(file: Path) -> None:
 def _sweep(path: Path) -> None:
     """Remove what killed writers of ``path`` on this machine left beside it."""
     for left in path.parent.glob(f".{escape(path.name)}.{escape(_MACHINE)}.*.tmp"):
-        writer = left.name.removesuffix(".tmp").rpartition(".")[2]
-        if left.name == f".{path.name}.{_MACHINE}.{writer}.tmp" and _ended(writer):
+        writer, _, rest = left.name.removeprefix(f".{path.name}.{_MACHINE}.").partition(".")
+        if rest.count(".") == 1 and _ended(writer):
             if left.is_dir():
                 shutil.rmtree(left)
             else:

@@ -203,8 +203,11 @@ class Report:
 
     def to_json(self, path: str | Path) -> None:
         """Write the report as JSON, wholly or not at all."""
-        text = json.dumps(_plain(self.to_dict()), indent=1, allow_nan=False)
-        write_text(path, text)
+        write_text(path, self.as_json())
+
+    def as_json(self) -> str:
+        """Return the report as JSON."""
+        return json.dumps(_plain(self.to_dict()), indent=1, allow_nan=False)
 
     def apply(
         self, env: EnvBase, physics: Physics | None = None, *, channels: Sequence[str] = ()
