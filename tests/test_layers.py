@@ -30,6 +30,7 @@ LAYERS = [
         "pairs",
         "simulate",
         "ray_collectors",
+        "ray_probe",
         "ray_worker",
         "real_trajectories",
         "robots",

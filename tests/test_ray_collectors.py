@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -308,6 +309,109 @@ def test_an_environment_with_other_physics_is_refused(collectors):
     whole = TransformedEnv(other, RewardSum())
     with pytest.raises(ValueError, match=r"with parameters in 'theta': length, got 'masspole'"):
         simulate(whole, None, SummaryStatistics(moments), randomizer, **asked)
+
+
+def limited(environments, randomizer=None, steps=5):
+    """The same environments whose episodes end earlier."""
+    physics = ApplyPhysics(AttributePhysics("length"))
+    transforms = [physics, randomizer or DomainRandomizer(PRIOR), StepCounter(steps), RewardSum()]
+    return TransformedEnv(CartPoleEnv(environments), Compose(*transforms))
+
+
+def heavy(environments, randomizer=None):
+    """The same environments whose poles are heavier."""
+    env = make(environments, randomizer)
+    env.base_env.set_parameters(
+        {"masspole": torch.full((environments,), 0.2)}, torch.ones(environments).bool()
+    )
+    return env
+
+
+@pytest.mark.parametrize(("other", "said"), [(limited, "step_count"), (heavy, "observation")])
+def test_an_environment_that_simulates_anything_else_is_refused(collectors, other, said):
+    randomizer = DomainRandomizer(PRIOR)
+    before = randomizer.get_extra_state()
+    with pytest.raises(
+        ValueError, match=f"simulates what make.. does on Ray, bit for bit.*{said}.*in step"
+    ):
+        collectors.check(other(N, randomizer))
+    after = randomizer.get_extra_state()
+    assert str(before) == str(after)
+    assert randomizer.source is PRIOR
+
+
+def test_what_later_steps_show_is_compared_as_far_as_pairs_reach(collectors):
+    collectors.check(longer := limited(N, steps=12))  # longer than T
+    collectors.check(longer)
+    with pytest.raises(ValueError, match="bit for bit"):
+        collectors.check(longer, trajectory=20)
+
+
+class Sleeping:
+    """A statistic that never ends, in the first process that computes it."""
+
+    def __init__(self, folder):
+        self.folder, self.home = folder, os.getpid()
+
+    def __call__(self, state, action, following, mask):
+        if os.getpid() != self.home and not (self.folder / "slept").exists():
+            (self.folder / "slept").touch()
+            time.sleep(1000)
+        return moments(state, action, following, mask)
+
+
+def test_a_worker_that_hangs_is_ended_and_its_share_simulated_again(
+    collectors, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(collectors, "_timeout", 8.0)  # time for one that is begun anew
+    before = set(workers())
+    there = pairs(SummaryStatistics(Sleeping(tmp_path)), collectors=collectors)
+    assert (tmp_path / "slept").exists()
+    assert before - set(workers())
+    assert torch.equal(pairs(SummaryStatistics(moments))["summary"], there["summary"])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "said"),
+    [
+        ({"worker": 3}, TypeError, "worker= to be a mapping of Ray's options, got 'int'"),
+        ({"cluster": 3}, TypeError, "cluster= to be a mapping of Ray's options, got 'int'"),
+        ({"worker": {"num_cpus": None}}, TypeError, r"worker\['num_cpus'\]"),
+        ({"worker": {"max_restarts": "x"}}, TypeError, r"worker\['max_restarts'\]"),
+        ({"environments": 10**9}, ValueError, "batches of at most 100000000 frames"),
+        ({"timeout": 0}, ValueError, "timeout"),
+        ({"timeout": "long"}, TypeError, "timeout"),
+    ],
+)
+def test_wrong_options_are_refused(cluster, wrong, error, said):
+    given = {"environments": N, "steps": STEPS, "workers": 1} | wrong
+    with pytest.raises(error, match=said):
+        RayCollectors(make, learner().policy, **given)
+
+
+def test_wrong_questions_are_refused(collectors):
+    statistics = SummaryStatistics(moments)
+    asked = {"steps": 3, "key": (0,), "progress": False}
+    with pytest.raises(ValueError, match=r"theta of shape \(N, D\), at least one row, got \(0, 1"):
+        collectors.summaries(None, statistics, torch.zeros(0, 1), **asked)
+    with pytest.raises(TypeError, match="theta, a tensor"):
+        collectors.summaries(None, statistics, [[0.5]], **asked)
+    with pytest.raises(ValueError, match="steps to be positive, got 0"):
+        collectors.summaries(None, statistics, torch.ones(2, 1), **(asked | {"steps": 0}))
+    with pytest.raises(TypeError, match="a TorchRL environment, got 'NoneType'"):
+        collectors.check(None)
+    with pytest.raises(TypeError, match="a DomainRandomizer, got 'NoneType'"):
+        collectors.begin(None, key=(0,))
+    collectors.begin(DomainRandomizer(PRIOR), key=(0,))
+    with pytest.raises(TypeError, match="a policy, a TensorDictModule, got 'NoneType'"):
+        collectors.batch(None)
+
+
+def test_options_that_ray_does_not_know_are_refused(monkeypatch):
+    ray = pytest.importorskip("ray", reason="Ray is not installed: pip install '.[ray]'")
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    with pytest.raises(ValueError, match=r"cluster= to be options of ray.init, got .*processors"):
+        RayCollectors(make, learner().policy, environments=N, steps=3, cluster={"processors": 2})
 
 
 def test_without_ray_its_extra_is_named(monkeypatch):

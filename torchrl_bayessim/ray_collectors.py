@@ -13,11 +13,12 @@ from __future__ import annotations
 __all__ = ["RayCollectors"]
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, Self
+from weakref import WeakKeyDictionary
 
 import torch
 from tensordict import TensorDictBase
@@ -30,13 +31,16 @@ from .diverged import UndisturbedPolicy
 from .errors import SimulationError, message
 from .kinds import check_function, check_kind
 from .pairs import counted
+from .ray_probe import difference, probed, probing
 from .ray_worker import Block, Inference, RayWorker, described
+from .scalars import check_number
 from .summaries import SummaryStatistics
 from .trajectories import concatenate, first_trajectories
 from .transforms.domain_randomizer import DomainRandomizer
 
 _CLUSTER = {"include_dashboard": False, "logging_level": "warning"}
 _WORKER = {"num_cpus": 1, "max_restarts": 10, "max_task_retries": 10}
+_MOST = 100_000_000  # frames of a training batch, which is held in memory
 
 
 class RayCollectors:
@@ -56,12 +60,16 @@ class RayCollectors:
         cluster: Options of ``ray.init``, for a cluster that is begun here.
         worker: Options of ``ray.remote``, such as ``{"num_cpus": 1}``: what a worker needs. After
             ``max_restarts`` deaths of a worker, or ``max_task_retries`` in one question, it fails.
+        timeout: Seconds after which a worker that has not answered a question (a share of the
+            pairs, or a training batch) counts as dead: it is ended, begun anew and asked again.
+            ``None``: never.
 
     Raises:
         ImportError: Ray is not installed.
-        TypeError: A number is no whole number, ``make`` no function or the policy none.
-        ValueError: A number is not positive, W does not divide N, the cluster has too few
-            processors, or an environment has no randomizer.
+        TypeError: A number is no whole number, ``make`` no function, the policy none or options
+            no mapping.
+        ValueError: A number is not positive, W does not divide N, N T is beyond 10⁸, Ray does not
+            know an option, the cluster has too few processors, or an environment has no randomizer.
         SimulationError: A worker cannot begin or, in a call, died too often. What a worker raises
             is raised here.
 
@@ -84,6 +92,7 @@ class RayCollectors:
         workers: int = 2,
         cluster: dict[str, Any] | None = None,
         worker: dict[str, Any] | None = None,
+        timeout: float | None = 3600.0,
     ) -> None:
         if find_spec("ray") is None:
             hint = 'pip install "torchrl_bayessim[ray]"'
@@ -96,18 +105,39 @@ class RayCollectors:
         if environments % workers:
             expected = f"a number of workers that divides the {environments} environments"
             raise ValueError(message(expected, workers))
+        if environments * steps > _MOST:
+            expected = f"batches of at most {_MOST} frames, environments times steps"
+            raise ValueError(message(expected, environments * steps))
+        for name, options in {"cluster": cluster, "worker": worker}.items():
+            if options is not None:
+                check_kind(f"{name}= to be a mapping of Ray's options", options, Mapping)
+        needs = _WORKER | dict(worker or {})
+        for name in _WORKER:
+            check_number(
+                f"worker[{name!r}]", needs[name], least=-1.0 if name != "num_cpus" else 0.0
+            )
+        if timeout is not None:
+            check_number("timeout", timeout, above=0.0)
         self.environments, self.steps, self.workers = environments, steps, workers
-        needs = _WORKER | (worker or {})
+        self._timeout = timeout
+        self._alike: WeakKeyDictionary[EnvBase, int] = WeakKeyDictionary()
         self._block: tuple[Any, DomainRandomizer] | None = None
         self._there: dict[str, str] | None = None  # what the workers' environments are
         self._own = not self._ray.is_initialized()
         if self._own:
-            self._ray.init(**(_CLUSTER | (cluster or {})))
+            self._init(cluster or {})
         with ExitStack() as undo:
             undo.callback(self._end_cluster)
             self._check_processors(needs["num_cpus"])
             self._collector = self._begun(make, policy, needs)
             undo.pop_all()
+
+    def _init(self, cluster: Mapping[str, Any]) -> None:
+        try:
+            self._ray.init(**{**_CLUSTER, **cluster})
+        except (TypeError, ValueError, RuntimeError) as error:
+            got = f"{sorted(cluster)}: {str(error).splitlines()[0]}"
+            raise ValueError(message("cluster= to be options of ray.init", got)) from error
 
     def _begun(self, make: Callable[[int], EnvBase], policy: Any, needs: dict[str, Any]) -> Any:
         """Return TorchRL's collector of the workers."""
@@ -161,6 +191,10 @@ class RayCollectors:
 
         They are those of :func:`.simulate.collect_summaries` in one process.
 
+        Raises:
+            TypeError: A count is no whole number, or θ no tensor.
+            ValueError: A count is too small, or there is no θ.
+
         Args:
             policy: That made the real data; ``None`` for uniformly random actions.
             statistics: Summaries.
@@ -171,6 +205,13 @@ class RayCollectors:
             prepare: Gives a batch its ``"mask"``.
             keep: Number of batches to send back too.
         """
+        for name, value in {"steps": steps, "trajectories": trajectories}.items():
+            check_count(name, value)
+        check_count("batches to keep", keep, least=0)
+        check_kind("parameters theta, a tensor (N, D)", theta, Tensor)
+        if theta.ndim != 2 or not len(theta):
+            expected = "parameters theta of shape (N, D), at least one row"
+            raise ValueError(message(expected, tuple(theta.shape)))
         asked = Inference(policy, statistics, trajectories, steps, key, prepare)
         question = self._ray.put(asked)
         batches = trajectories // math.gcd(self.environments, trajectories)  # end with a pair
@@ -201,12 +242,24 @@ class RayCollectors:
             batches += kept
         return torch.cat(found), batches
 
-    def check(self, env: EnvBase, *, steps: int | None = None) -> None:
-        """Refuse an environment of another size, physics or entries, or batches of another length.
+    def check(
+        self, env: EnvBase, *, steps: int | None = None, trajectory: int | None = None
+    ) -> None:
+        """Refuse an environment that does not simulate what those on Ray do, to the last bit.
+
+        Size, physics and entries are compared by name, then a batch of random actions that is
+        simulated on either side, once for each environment.
+
+        Args:
+            env: Of this process.
+            steps: Of its training batches; default T.
+            trajectory: Steps of the batch that is compared; default T.
 
         Raises:
+            TypeError: It is no environment.
             ValueError: Pairs and batches would not be those of this environment.
         """
+        check_kind("a TorchRL environment", env, EnvBase)
         got = (max(1, env.batch_size.numel()), steps or self.steps)
         if got != (self.environments, self.steps):
             expected = f"{self.environments} environments of {self.steps} steps, as on Ray"
@@ -219,12 +272,31 @@ class RayCollectors:
             if asked != made:
                 expected = f"an environment as make() gives on Ray, with {name}: {made}"
                 raise ValueError(message(expected, asked, hint="one make() for both"))
+        self._compare(env, max(trajectory or 0, self.steps))
+
+    def _compare(self, env: EnvBase, steps: int) -> None:
+        """Compare a batch that is simulated here with the same of a worker."""
+        if self._alike.get(env, 0) >= steps:
+            return
+        question, theta = probing(env, steps)
+        nothing = (None, theta[:0], 0, 0)
+        asked = [(question, theta, 0, 1), *[nothing] * (self.workers - 1)]
+        (_, (there,)), *_ = self._ask("summarise", asked)
+        if other := difference(probed(env, question, theta), there):
+            expected = "an environment that simulates what make() does on Ray, bit for bit"
+            hint = "one make() for both, with the same transforms and physics"
+            raise ValueError(message(expected, other, hint=hint))
+        self._alike[env] = steps
 
     def begin(self, randomizer: DomainRandomizer, *, key: tuple[int | str, ...]) -> None:
         """Begin new episodes, with θ from the randomizer's source, for the batches that follow.
 
         The randomizer counts the episodes, as it does for environments of this process.
+
+        Raises:
+            TypeError: It is no randomizer.
         """
+        check_kind("a DomainRandomizer", randomizer, DomainRandomizer)
         state = randomizer.get_extra_state()
         episodes = torch.zeros(self.environments, dtype=torch.int64)
         known = state["episodes"][: self.environments]
@@ -237,7 +309,9 @@ class RayCollectors:
 
         Raises:
             RuntimeError: Nothing has begun.
+            TypeError: The policy is none.
         """
+        check_kind("a policy, a TensorDictModule", policy, TensorDictModuleBase)
         if self._block is None:
             raise RuntimeError(message("begin() before the first batch", "none"))
         block, randomizer = self._block
@@ -267,7 +341,24 @@ class RayCollectors:
             got = "collectors that were shut down"
             raise RuntimeError(message("collectors with workers", got, hint="begin new ones"))
         with self._errors():
-            return self._collector.map_fn(method, list(arguments))
+            workers = self._collector.remote_collectors
+            answers = [
+                worker.cascade_execute.remote(method, *given)
+                for worker, given in zip(workers, arguments, strict=True)
+            ]
+            self._end_hanging(dict(zip(answers, workers, strict=True)))
+            return self._ray.get(answers)
+
+    def _end_hanging(self, waiting: dict[Any, Any]) -> None:
+        """Wait for answers; end workers that take too long, which Ray then begins anew."""
+        while waiting:
+            done, late = self._ray.wait(
+                list(waiting), num_returns=len(waiting), timeout=self._timeout, fetch_local=False
+            )
+            for answer in done:
+                del waiting[answer]
+            for answer in late:
+                self._ray.kill(waiting[answer], no_restart=False)
 
     @contextmanager
     def _errors(self) -> Iterator[None]:

@@ -6,7 +6,7 @@ asked again, with the same answer.
 
 from __future__ import annotations
 
-__all__ = ["Block", "Inference", "RayWorker", "described"]
+__all__ = ["Block", "Inference", "RayWorker", "described", "randomizer_of"]
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -86,7 +86,7 @@ class RayWorker(Collector):
             return collect_summaries(
                 collector,
                 question.statistics,
-                _randomizer(self._whole),
+                randomizer_of(self._whole),
                 theta,
                 trajectories=question.trajectories,
                 key=question.key,
@@ -105,7 +105,7 @@ class RayWorker(Collector):
         """
         import ray  # pyright: ignore[reportMissingImports]
 
-        randomizer, before = _randomizer(self.env), len(weights) - 1
+        randomizer, before = randomizer_of(self.env), len(weights) - 1
         if self._at != (block.key, before):
             self._restart(block, randomizer)
             for step in range(before):
@@ -144,7 +144,7 @@ def described(env: EnvBase) -> dict[str, str]:
     return found
 
 
-def _randomizer(env: EnvBase) -> DomainRandomizer:
+def randomizer_of(env: EnvBase) -> DomainRandomizer:
     """Return the randomizer of an environment."""
     found = next(randomizers(env), None)
     if found is None:

@@ -275,7 +275,7 @@ def simulate(
         check_count(name, value)
     if collectors is not None:
         check_function("RayCollectors", getattr(collectors, "check", None))
-        collectors.check(env)
+        collectors.check(env, trajectory=max_steps)
     asked: dict[str, Any] = {"trajectories": trajectories, "key": (seed,)}
     with nullcontext() if folder is None else replacing_folder(folder) as beside:
         found = empty_pairs(pairs, beside)
