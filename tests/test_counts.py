@@ -100,3 +100,11 @@ def test_whole_numbers_of_any_kind_are_counts():
             check_count("steps", value, least=4)
     with pytest.raises(TypeError, match=r"a whole number of steps, got 1000\.0\. Try: 1000"):
         check_count("steps", 1e3)
+
+
+def test_counts_that_would_not_end_are_refused():
+    check_count("epochs", 10**15)
+    with pytest.raises(
+        ValueError, match="at most 1000000000000000 epochs, got 100000000000000000000"
+    ):
+        fitted(epochs=10**20)

@@ -12,15 +12,16 @@ import torch
 
 from .errors import message
 
+_MOST = 10**15  # beyond which counting would not end, and products of counts overflow
 _BOOLEANS = (torch.bool, np.dtype(bool))  # which Python counts as 0 and 1
 
 
 def check_count(name: str, value: Any, *, least: int = 1) -> None:
-    """Refuse what is not a whole number of at least ``least``.
+    """Refuse what is not a whole number of at least ``least``, and at most 10¹⁵.
 
     Raises:
         TypeError: It is not a whole number: ``16.0`` is none, as for :func:`range`, nor ``True``.
-        ValueError: It is too small.
+        ValueError: It is too small, or absurdly large.
 
     Example:
         >>> check_count("episodes", 2)
@@ -38,3 +39,5 @@ def check_count(name: str, value: Any, *, least: int = 1) -> None:
     if number < least:
         expected = {0: f"{name} not to be negative", 1: f"{name} to be positive"}
         raise ValueError(message(expected.get(least, f"at least {least} {name}"), number))
+    if number > _MOST:
+        raise ValueError(message(f"at most {_MOST} {name}", number))

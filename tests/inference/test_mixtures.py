@@ -246,3 +246,76 @@ def test_reduction_keeps_separate_modes_apart():
 def test_reduction_drops_what_holds_nothing():
     mixture = line_mixture([1.0, 1e-12], [0.0, 5.0], [1.0, 1.0])
     assert reduce(mixture, 8).loc.tolist() == [[0.0]]
+
+
+WIDE = 50.0 * torch.eye(2, dtype=torch.float64)
+
+
+def operations(mixture):
+    """Yield what the algebra does with a mixture."""
+    one = random_mixture(1)
+    yield lambda: moment_match(mixture)
+    yield lambda: multiply(mixture, one)
+    yield lambda: multiply(one, mixture)
+    yield lambda: divide(mixture, torch.zeros(2).double(), WIDE / 5, widest=WIDE)
+    yield lambda: reduce(mixture, 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda m: m._replace(logits=m.logits - math.inf), "a weight above 0, got 'logits of -inf"),
+        (lambda m: m._replace(logits=m.logits * math.nan), "finite means, covariances and weights"),
+        (lambda m: m._replace(loc=m.loc * math.nan), "NaN or infinity in component 0 of 3"),
+        (
+            lambda m: m._replace(scale_tril=m.scale_tril * math.inf),
+            "NaN or infinity in component 0",
+        ),
+        (lambda m: m._replace(scale_tril=-m.scale_tril), "got 'a negative diagonal in component 0"),
+        (lambda m: m._replace(scale_tril=m.scale_tril + 1), "got 'entries above the diagonal in"),
+        (lambda m: m._replace(loc=m.loc[:2]), r"a mixture of shapes \(\*, K\)"),
+        (lambda m: m._replace(scale_tril=m.scale_tril[:, :1]), r"a mixture of shapes \(\*, K\)"),
+    ],
+)
+def test_what_is_no_mixture_is_refused(change, said):
+    for operation in operations(change(random_mixture(0))):
+        with pytest.raises(ValueError, match=said):
+            operation()
+
+
+def test_a_weight_of_zero_is_one():
+    mixture = random_mixture(0)
+    without = mixture._replace(logits=torch.tensor([-math.inf, 0.3, -0.2], dtype=torch.float64))
+    rest = Mixture(*(part[1:] for part in without))
+    for here, there in zip(moment_match(without), moment_match(rest), strict=True):
+        assert torch.allclose(here, there)
+    assert torch.allclose(reduce(without, 1).loc, reduce(rest, 1).loc)
+
+
+def test_other_dimensions_and_asymmetric_covariances_are_refused():
+    one, mean = random_mixture(0), torch.zeros(2).double()
+    skew = WIDE / 5 + torch.tensor([[0.0, 1.0], [0.0, 0.0]])
+    with pytest.raises(ValueError, match="a second mixture of 2 dimensions, got 3"):
+        multiply(one, random_mixture(0, dim=3))
+    with pytest.raises(ValueError, match="a second mixture of 1 dimensions, got 2"):
+        multiply(random_mixture(0, dim=1), one)
+    with pytest.raises(ValueError, match=r"mean of the divisor of shape \(\*, 2\), got \(1,\)"):
+        divide(one, mean[:1], WIDE / 5, widest=WIDE)
+    with pytest.raises(ValueError, match=r"covariance of the divisor of shape \(\*, 2, 2\)"):
+        divide(one, mean, WIDE[:1, :1], widest=WIDE)
+    with pytest.raises(ValueError, match="covariance of the divisor to be symmetric, got 'entries"):
+        divide(one, mean, skew, widest=WIDE)
+    with pytest.raises(ValueError, match="widest to be symmetric"):
+        divide(one, mean, WIDE / 5, widest=skew)
+    with pytest.raises(ValueError, match=r"positive definite, got 'a variance of -10"):
+        divide(one, mean, -WIDE / 5, widest=WIDE)
+
+
+def test_a_mixture_is_reduced_to_one_component_or_more():
+    one = random_mixture(0)
+    with pytest.raises(ValueError, match="components to be positive, got 0"):
+        reduce(one, 0)
+    with pytest.raises(TypeError, match=r"a whole number of components, got 1\.5"):
+        reduce(one, 1.5)
+    with pytest.raises(ValueError, match=r"an unbatched mixture.*got \(4, 3\)"):
+        reduce(random_mixture(0, batch=(4,)), 1)

@@ -23,7 +23,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..counts import check_count
 from ..errors import message
+from .mixture_checks import check_covariance, check_mixture, first_marked
 
 _ROUNDING = 1e-9  # of the widest variance
 _THINNEST = 1e-12
@@ -93,7 +95,16 @@ def moment_match(mixture: Mixture) -> tuple[Tensor, Tensor]:
         S = \sum_k \alpha_k (\Sigma_k + (\mu_k - m)(\mu_k - m)^T),
 
     the spread between the components included.
+
+    Raises:
+        ValueError: A parameter is not finite, all weights are 0, or shapes and factors are those of
+            no mixture.
     """
+    check_mixture(*mixture)
+    return _moments(mixture)
+
+
+def _moments(mixture: Mixture) -> tuple[Tensor, Tensor]:
     weight = mixture.logits.softmax(-1).unsqueeze(-1)
     mean = (weight * mixture.loc).sum(-2)
     centred = mixture.loc - mean.unsqueeze(-2)
@@ -111,8 +122,11 @@ def multiply(first: Mixture, second: Mixture) -> Mixture:
     own deviation.
 
     Raises:
-        ValueError: A parameter is not finite, or a mixture is a single point.
+        ValueError: As :func:`moment_match`, a mixture is a single point, or they have another D.
     """
+    sizes = first.loc.shape[-1], second.loc.shape[-1]
+    if sizes[0] != sizes[1]:
+        raise ValueError(message(f"a second mixture of {sizes[0]} dimensions", sizes[1]))
     first, second = _spread_out(first), _spread_out(second)
     loc_1, loc_2 = torch.broadcast_tensors(first.loc.unsqueeze(-2), second.loc.unsqueeze(-3))
     cov_1, cov_2 = torch.broadcast_tensors(
@@ -152,8 +166,9 @@ def divide(mixture: Mixture, mean: Tensor, covariance: Tensor, *, widest: Tensor
             :math:`B - \Sigma'_k` is positive semidefinite.
 
     Raises:
-        ValueError: A parameter is not finite, the dividend is a single point, or a covariance is
-            indefinite by more than rounding.
+        ValueError: As :func:`moment_match`, the dividend is a single point, the divisor or
+            ``widest`` has another D, or a covariance is asymmetric, or indefinite by more than
+            rounding.
 
     Example:
         >>> wide = Mixture(torch.zeros(1), torch.zeros(1, 1), 2 * torch.ones(1, 1, 1))
@@ -163,6 +178,11 @@ def divide(mixture: Mixture, mean: Tensor, covariance: Tensor, *, widest: Tensor
         >>> round(quotient.mixture.covariance.item(), 4)
         8.0
     """
+    size = mixture.loc.shape[-1]
+    if mean.shape[-1:] != (size,):
+        raise ValueError(message(f"a mean of the divisor of shape (*, {size})", tuple(mean.shape)))
+    check_covariance("the covariance of the divisor", covariance, size)
+    check_covariance("widest", widest, size)
     mixture, scale_0 = _spread_out(mixture), _cholesky(covariance)
     if not mean.isfinite().all():
         raise ValueError(message("a finite mean of the divisor", mean.tolist()))
@@ -204,8 +224,14 @@ def reduce(mixture: Mixture, components: int) -> Mixture:
     \alpha_j\log|\Sigma_j|]`. Components that together hold less than 1e-9 are dropped first.
 
     Raises:
-        ValueError: A parameter is not finite, or the mixture is a single point.
+        ValueError: As :func:`moment_match`, the mixture is batched or a single point, or there
+            would be no component.
+        TypeError: ``components`` is no whole number.
     """
+    check_count("components", components)
+    if mixture.logits.ndim != 1:
+        expected = "an unbatched mixture, logits of shape (K,)"
+        raise ValueError(message(expected, tuple(mixture.logits.shape)))
     mixture = _spread_out(mixture)
     logits, order = mixture.logits.log_softmax(-1).sort(descending=True)
     keep = max(1, int((logits.exp().flip(0).cumsum(0).flip(0) > 1e-9).sum()))
@@ -224,7 +250,7 @@ def reduce(mixture: Mixture, components: int) -> Mixture:
 
 
 def _merge(weight: Tensor, loc: Tensor, cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    mean, covariance = moment_match(Mixture(weight.log(), loc, _cholesky(cov)))
+    mean, covariance = _moments(Mixture(weight.log(), loc, _cholesky(cov)))
     return weight.sum(0, keepdim=True), mean[None], covariance[None]
 
 
@@ -243,34 +269,23 @@ def _spread_out(mixture: Mixture) -> Mixture:
     """Return a mixture without points: components of no width get some, with a warning.
 
     Raises:
-        ValueError: A parameter is not finite, or there is no scale to take a width from.
+        ValueError: It is no mixture, or there is no scale to take a width from.
     """
+    check_mixture(*mixture)
     logits, loc, scale = mixture
-    covariance = mixture.covariance
-    wrong = ~covariance.isfinite().flatten(-2).all(-1) | ~loc.isfinite().all(-1)
-    wrong = wrong | logits.isnan() | logits.isposinf()
-    if wrong.any():
-        expected = "components of finite means, covariances and weights"
-        raise ValueError(message(expected, f"NaN or infinity in {_first(wrong)}"))
-    points = (covariance == 0).flatten(-2).all(-1)
+    points = (mixture.covariance == 0).flatten(-2).all(-1)
     if not points.any():
         return mixture
-    size = moment_match(mixture)[1].diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True).sqrt()
+    size = _moments(mixture)[1].diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True).sqrt()
     alone = points & ~(size > 0)
     if alone.any():
         expected = "a mixture of some width, to which points in it are widened"
-        raise ValueError(message(expected, f"a covariance of 0 in {_first(alone)}"))
+        raise ValueError(message(expected, f"a covariance of 0 in {first_marked(alone)}"))
     text = f"{int(points.sum())} of {points.numel()} components have collapsed to points: widened"
     warnings.warn(text, stacklevel=3)
     width = size * max(_THINNEST, 1e2 * torch.finfo(scale.dtype).eps) ** 0.5
     least = width[..., None, None] * torch.eye(scale.shape[-1]).to(scale)
     return Mixture(logits, loc, torch.where(points[..., None, None], least, scale))
-
-
-def _first(marked: Tensor) -> str:
-    """Return the name of the first component that is marked, among ``(*, K)``."""
-    *row, k = marked.nonzero()[0].tolist()
-    return f"component {k} of {marked.shape[-1]}" + (f", row {row}" if row else "")
 
 
 def _cholesky(matrix: Tensor) -> Tensor:
