@@ -50,7 +50,7 @@ def test_the_generator_imports_nothing_of_the_package():
                 assert module in GENERATOR, f"{name} imports {module}"
             else:
                 assert module.split(".")[0] in {
-                    *("__future__", "collections", "dataclasses", "hashlib", "io", "math"),
+                    *("__future__", "collections", "copy", "dataclasses", "hashlib", "io", "math"),
                     *(
                         "pathlib",
                         "re",
@@ -354,6 +354,23 @@ def test_detectability_is_nothing_without_a_cause_and_grows_with_it():
     some = make(Plan("T1", "arm", ("coulomb_friction",)), np.random.default_rng(3))
     assert none.detectability < 0.5
     assert some.detectability > 100
+
+
+def test_a_pair_is_as_visible_as_the_less_visible_of_its_causes(monkeypatch):
+    from withheld import cases
+
+    found = []
+
+    def spy(*args, **options):
+        found.append(detectability(*args, **options))
+        return found[-1]
+
+    detectability = cases.detectability
+    monkeypatch.setattr(cases, "detectability", spy)
+    plan = cases.Plan("T5", "arm", ("coulomb_friction", "sensor_drift"))
+    case = cases.make(plan, np.random.default_rng(0))
+    assert len(found) == 2
+    assert case.detectability == min(found) < max(found)
 
 
 def test_a_sensor_of_velocities_has_velocities_logged_and_a_withheld_case_a_list():

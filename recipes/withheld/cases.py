@@ -5,6 +5,7 @@ from __future__ import annotations
 __all__ = ["Case", "Plan", "make", "sites"]
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -20,7 +21,7 @@ from .classes import without_class_of
 from .detectability import detectability
 from .excitation import KINDS, open_loop, proportional
 from .laws import Made, Site
-from .plant import Motion, Plant, Policy, Truth
+from .plant import Cause, Motion, Plant, Policy, Truth
 from .plant_bullet import BulletPlant
 from .robots import ROBOTS, Robot, nominal_model, write_entry
 
@@ -70,7 +71,8 @@ class Case:
         real_noise: Those of the sensors.
         velocities: Whether velocities are logged.
         effects: Names that the diagnosis may consider; nothing for all.
-        detectability: See `detectability`.
+        detectability: See `detectability`; of several causes, the least that one of them has in
+            the same data without the others.
         excitation: How it was moved.
     """
 
@@ -112,22 +114,32 @@ def _make(plan: Plan, rng: np.random.Generator) -> Case:
     nv = nominal.nv
     noise = np.repeat([_log(rng, 1e-3, 3e-3), _log(rng, 1e-2, 3e-2)], nv)
     kind = BulletPlant if plan.engine == "bullet" else Plant
-    plant = kind(
-        _true_model(nominal, robot, plan.engine), robot.control_dt, [c for c, _ in made], noise, rng
-    )
+
+    def plant_with(causes: list[Cause], rng: np.random.Generator) -> Plant:
+        return kind(_true_model(nominal, robot, plan.engine), robot.control_dt, causes, noise, rng)
+
+    plant = plant_with([c for c, _ in made], rng)
     loops = str(rng.choice(["open", "open", "closed", "mixed"]))
     velocities = bool(rng.random() < 0.75) or bool(_OF_VELOCITIES & set(plan.causes))
     told = noise if rng.random() < 0.5 else None
     if plan.control == "noise":
         told, plant.noise = noise, 2.0 * noise
     count, steps = int(rng.integers(6, 13)), int(rng.integers(*robot.steps, endpoint=True))
+    before = deepcopy(rng)
     motions = _motions(plant, robot, loops, count=count, steps=steps, rng=rng)
     real, plant.noise = plant.noise, 0.0 * noise
     unseen = _motions(plant, robot, loops, count=3, steps=steps, rng=rng)
     measured = np.repeat([True, velocities], nv)
-    visible = detectability(
-        nominal, motions, substeps=round(robot.control_dt / nominal.opt.timestep),
-        noise=real, measured=measured, parameters=list(priors),
+    seen = [motions]
+    if len(made) > 1:  # each alone, in the same data
+        lone = [plant_with([cause], deepcopy(before)) for cause, _ in made]
+        seen = [_motions(p, robot, loops, count=count, steps=steps, rng=p.rng) for p in lone]
+    visible = min(
+        detectability(
+            nominal, some, substeps=round(robot.control_dt / nominal.opt.timestep),
+            noise=real, measured=measured, parameters=list(priors),
+        )
+        for some in seen
     )  # fmt: skip
     if plan.control == "shuffled":
         motions = [replace(m, ctrl=motions[i - 1].ctrl) for i, m in enumerate(motions)]
