@@ -308,15 +308,43 @@ def test_effects_that_follow_see_a_changed_command():
 # Model entries.
 
 
-def written(name, strength):
-    robot = arm()
+def written(name, strength, robot=None, **options):
+    robot = robot or arm()
     models = ModelBatch(robot.model, 1)
-    law = effect(name)
+    law = effect(name, **options)
     fields = ModelFields(models)
     values = strength_of(name, strength, law.targets(robot))
     law.write(fields, values.expand(1, -1), robot)
     fields.finish()
     return models
+
+
+HELD = """
+<mujoco><worldbody><body name="link" euler="0 20 0">
+  <joint axis="0 1 0" pos="0 0 .1"/>
+  <geom type="capsule" fromto="0 0 .1 .3 0 -.3" size=".02" mass=".6"/>{held}
+</body></worldbody></mujoco>"""
+POINT = '<geom type="sphere" pos=".3 0 -.3" size="1e-4" mass=".25"/>'
+
+
+def test_a_payload_at_the_end_is_what_mujoco_makes_of_a_point_mass_there():
+    bare, held = (mujoco.MjModel.from_xml_string(HELD.format(held=p)) for p in ("", POINT))
+    robot = robot_of(Task(model=bare, frame_skip=1))
+    models = written("payload", {"link": 0.25}, robot, at_end=True)
+    for field in ("body_mass", "body_ipos", "body_inertia"):
+        expected = np.atleast_1d(getattr(held, field)[1])
+        shape = getattr(bare, field).shape[1:]
+        found = [models.read(field, (1, *at)).item() for at in np.ndindex(shape)]
+        assert found == pytest.approx(expected.tolist(), abs=1e-7)
+
+
+def test_a_body_without_an_end_of_its_own_carries_nothing_there():
+    beside = HELD.replace('pos="0 0 .1"', 'pos="0 0 .2"').format(held="")  # not along the capsule
+    sliding = HELD.replace("<joint ", '<joint type="slide" ').format(held="")
+    for text in (beside, sliding):
+        robot = robot_of(Task(model=mujoco.MjModel.from_xml_string(text), frame_skip=1))
+        assert effect("payload").targets(robot) == ("link",)
+        assert effect("payload", at_end=True).targets(robot) == ()
 
 
 def test_entries():

@@ -9,36 +9,73 @@ __all__ = ["ComShift", "GravityTilt", "LinkLength", "Payload", "TimeScale"]
 
 import math
 
+import mujoco
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from .effect import Fields, ModelEffect
+from .effect import Effect, Fields, ModelEffect
 from .robot import Robot
+
+_ALONG = 1e-3  # of a length: how far a body's end may lie beside its axis
 
 
 class Payload(ModelEffect):
-    """Mass ``s`` is added to a body, and its inertia grows in proportion; kg, up to its mass."""
+    """Mass ``s`` is added to a body, spread as its own or at its far end; kg, up to its mass.
+
+    Spread, the inertia grows in proportion. At the end, as in a gripper, it is a point at
+    ``r = c − a`` from the centre of mass ``c``, as far again from the joint's anchor ``a``: the
+    centre moves by ``r s / (m + s)``, and about it the inertia grows by
+    ``(|r|² I − r rᵀ) m s / (m + s)`` (parallel axes). Bodies for which that is not along their
+    principal axes have no end.
+
+    Args:
+        at_end: Where it is.
+    """
 
     name, unit, group = "payload", "kg", "inertia"
 
+    def __init__(self, *, at_end: bool = False) -> None:
+        self.at_end = at_end
+
+    def forms(self, seconds: float) -> tuple[Effect, ...]:
+        """Return both places."""
+        del seconds
+        return Payload(), Payload(at_end=True)
+
     def targets(self, robot: Robot) -> tuple[str, ...]:
-        """Return the names of bodies that move and have a mass."""
-        return tuple(_name(robot, b) for b in _heavy(robot))
+        """Return the names of bodies that move and have a mass (and an end)."""
+        return tuple(_name(robot, b) for b in self._bodies(robot))
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and the body's mass."""
-        mass = _values([robot.require_model().body_mass[b] for b in _heavy(robot)])
+        mass = _values([robot.require_model().body_mass[b] for b in self._bodies(robot)])
         return torch.zeros_like(mass), mass
 
     def joint(self, robot: Robot, target: int) -> int:
         """Return the joint that moves the body."""
-        return _joint_of(robot, _heavy(robot)[target])
+        return _joint_of(robot, self._bodies(robot)[target])
 
     def write(self, fields: Fields, strength: Tensor, robot: Robot) -> None:
-        """Add to the masses."""
-        for i, body in enumerate(_heavy(robot)):
-            entry = "body_mass", (body,)
-            fields[entry] = fields[entry] + strength[..., i]
+        """Add to the masses, and move the centres."""
+        for i, body in enumerate(self._bodies(robot)):
+            entry, added = ("body_mass", (body,)), strength[..., i]
+            mass = fields[entry]
+            inertia = [fields["body_inertia", (body, axis)] for axis in range(3)]
+            fields[entry] = mass + added
+            if not self.at_end:
+                continue
+            share, reach, arm = added / (mass + added), *_end(robot, body)
+            for axis in range(3):
+                place, about = ("body_ipos", (body, axis)), ("body_inertia", (body, axis))
+                fields[place] = fields[place] + share * float(reach[axis])
+                further = float(arm @ arm - arm[axis] ** 2)
+                fields[about] = inertia[axis] + share * mass * further
+
+    def _bodies(self, robot: Robot) -> list[int]:
+        heavy = _heavy(robot)
+        return [b for b in heavy if _has_end(robot, b)] if self.at_end else heavy
 
 
 class ComShift(ModelEffect):
@@ -183,6 +220,28 @@ def _moving(robot: Robot) -> list[int]:
 
 def _heavy(robot: Robot) -> list[int]:
     return [b for b in _moving(robot) if robot.require_model().body_mass[b] > 0]
+
+
+def _end(robot: Robot, body: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return ``r``, from a body's centre of mass to its end, in its own and its principal axes."""
+    model = robot.require_model()
+    anchor = np.zeros(3)
+    if model.body_jntnum[body]:
+        anchor = model.jnt_pos[model.body_jntadr[body]]
+    reach, arm, back = model.body_ipos[body] - anchor, np.zeros(3), np.zeros(4)
+    mujoco.mju_negQuat(back, model.body_iquat[body])
+    mujoco.mju_rotVecQuat(arm, reach, back)
+    return reach, arm
+
+
+def _has_end(robot: Robot, body: int) -> bool:
+    """Return whether a body turns about something beside its centre, along a principal axis."""
+    model = robot.require_model()
+    first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+    turns = mujoco.mjtJoint.mjJNT_HINGE in model.jnt_type[first : first + count]
+    lengths = np.sort(np.abs(_end(robot, body)[1]))
+    along = lengths[1] <= _ALONG * lengths[2]
+    return bool(turns and lengths[2] > 0 and along and not model.body_simple[body])
 
 
 def _joint_of(robot: Robot, body: int) -> int:
