@@ -83,3 +83,28 @@ def test_samples_and_commands_are_told_apart():
     rng = np.random.default_rng(4)
     data = [shown_again(log, 0.2, rng) for log in logs(8)]
     assert diagnose(system(), None, data, effects=SOME).confusion_set == ("sensor_dropout",)
+
+
+def test_friction_and_samples_that_are_not_renewed_are_both_named():
+    rng = np.random.default_rng(6)
+    data = logs(8, push=lambda _, v: -0.15 * np.tanh(v / 0.02))
+    report = diagnose(system(), None, [shown_again(log, 0.1, rng) for log in data], effects=SOME)
+    assert report.verdict in {"named", "named_partial"}
+    found = {effect.name: effect for effect in report.effects}
+    assert set(found) == {"coulomb_friction", "sensor_dropout"}
+    assert found["coulomb_friction"].strength == pytest.approx(0.15, rel=0.1)
+    assert found["sensor_dropout"].strength == pytest.approx(0.1, rel=0.5)
+    assert {effect.name for effect in report.strengths} == set(found)
+    shares = [effect.share_of_gap for effect in report.effects]
+    assert min(shares) > 0.0
+    assert sum(shares) == pytest.approx(explained(report))
+    low, high = report.gap.ci95
+    assert low <= explained(report) <= high
+
+
+def test_nothing_is_lost_where_commands_are_late_in_a_way_that_no_effect_has():
+    def smeared(u, k):
+        return float(np.mean(u[max(k - 5, 0) : k + 1]))
+
+    report = diagnose(system(), None, logs(8, act=smeared), effects=(*SOME, "action_lag"))
+    assert not {effect.name for effect in report.effects} & {"packet_drop", "sensor_dropout"}

@@ -55,6 +55,7 @@ class Chance:
         left: Mean squares of its standardised innovations in test segments, shape ``(S,)``.
         before: Mean square of the innovations of these segments without it, where they are others
             than those of the other figures.
+        beside: Whether it acts beside the best explanation without chance, not in its place.
     """
 
     unit: Unit
@@ -63,6 +64,7 @@ class Chance:
     gain: float
     left: Array
     before: float | None = None
+    beside: bool = False
 
 
 @dataclass(frozen=True, eq=False)

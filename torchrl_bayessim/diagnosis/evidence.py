@@ -90,7 +90,11 @@ def assemble(
     )
     effects = _effects(selection, credit, measured, system.robot)
     strengths = _by_target(best.fit.point, system.robot)
-    if scatter.found:
+    if scatter.beside:
+        alone, measured = measured.explained, scatter.measured(measured, generator)
+        effects += scatter.findings(measured, system.robot, others=alone)
+        strengths |= scatter.strengths(system.robot)
+    elif scatter.found:
         measured, confused = scatter.measured(measured, generator), scatter.names
         effects = scatter.findings(measured, system.robot)
         strengths = scatter.strengths(system.robot)
@@ -113,10 +117,8 @@ def assemble(
         rollout_rmse=rollouts,
     )
     where, remainder = _locations(prepared, selection, credit)
-    points = {"as described": zero, "with fitted parameters": nominal.fit.point}
-    if best.units:
-        points["with the effects"] = best.fit.point
-    alarms += divergence_alarms(test, points)
+    named = ["as described", "with fitted parameters", "with the effects"][: 2 + bool(best.units)]
+    alarms += divergence_alarms(test, dict(zip(named, points, strict=False)))
     verdict, summary, more = conclude(
         system,
         prepared,

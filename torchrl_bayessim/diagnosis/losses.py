@@ -4,7 +4,8 @@ A value that is lost leaves the last one in its place. If one in fifty is, most 
 and their mean and covariance say little; but where it happened it can be seen. In short segments
 every pattern of a few losses is tried (`loss_law`), and what must be beaten is the same law without
 losses, where some segments are spoiled by something else: losses have to explain what they spoil,
-and not only that some segments are worse than others.
+and not only that some segments are worse than others. They are looked for in the place of the
+effects that the search found, and beside them.
 
 Effects of commands are linear in them over so few steps, so every pattern is made of one simulation
 per step; those of samples are the simulated values.
@@ -27,7 +28,7 @@ from ..effects.sensors import SensorDropout
 from .chance import Chance
 from .loss_law import LossLaw, Told, Tried
 from .modes import Mode
-from .objective import Objective, Point, Unit
+from .objective import Objective, Point, Unit, strengths_of
 from .preparation import Prepared
 from .segments import cut
 from .selection import Selection
@@ -65,9 +66,15 @@ class _Data:
     point: Point
     left: Array
 
-    def without(self, point: Point) -> Tried:
-        """Return the segments without losses, in some simulator."""
-        squares = (self.objective([point])[0] ** 2).mean(-1)[None]
+    @classmethod
+    def of(cls, objective: Objective, point: Point) -> _Data:
+        """Return the segments of an objective in a simulator."""
+        return cls(objective, point, objective([point])[0])
+
+    @property
+    def without(self) -> Tried:
+        """The segments without losses."""
+        squares = (self.left**2).mean(-1)[None]
         return Tried(squares, np.zeros(1, dtype=np.int64), self.objective.segments.horizon)
 
     def tried(self, unit: Unit) -> Tried:
@@ -87,7 +94,8 @@ class _Data:
         """What all channels would show, shape ``(S, H, C)``."""
         predictor = self.objective.predictor
         theta = self.objective.theta(self.point.z[None])
-        qpos, qvel = predictor.states(self.objective.segments, theta)
+        strengths = strengths_of([self.point], predictor.system.robot)
+        qpos, qvel = predictor.states(self.objective.segments, theta, strengths)
         return np.nan_to_num(predictor.sensing.values(qpos[0], qvel[0]))
 
     def _of_commands(self, actuator: int, patterns: Patterns) -> Iterator[Array]:
@@ -139,21 +147,41 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
     some = [u for u in units if isinstance(u.effect, PacketDrop | SensorDropout) and _single(u)]
     if not some or type(prepared.mode) is not Mode:
         return []
-    data = _cut(prepared)
-    judged = [data["train"], data["validation"]]
-    nominal, best = (
-        [one.without(point) for one in judged]
-        for point in (judged[0].point, selection.best.fit.point)
-    )
-    size = judged[0].left.shape[1]
-    laws = [LossLaw(0.0, *some, size) for some in product(_SCATTER.tolist(), _SPOILED)]
-    base = min(laws, key=lambda law: law.deviance(nominal))
+    nominal = _cut(prepared)
+    base = _law(nominal)
+    best = {n: _Data.of(one.objective, selection.best.fit.point) for n, one in nominal.items()}
+    rival = _law(best)
     # what the best explanation without chance gains by the same standard
-    least = max(_NEEDED, base.deviance(nominal) - base.deviance(best))
-    found = [_found(data, unit, base) for unit in some]
-    kept = [one for one in found if one is not None and one.gain > least]
+    least = base.deviance(_judged(nominal)) - rival.deviance(_judged(best))
+    found = _all_found(nominal, some, base)
+    kinds = {unit.effect.group for unit in selection.best.units}
+    if kinds and "timing" not in kinds:  # a lag of another form leaves what losses would
+        beside = [replace(one, beside=True) for one in _all_found(best, some, rival)]
+        if _most(beside) > _most(found) - least + _NEEDED:
+            found, least = beside, 0.0
+    kept = [one for one in found if one.gain > max(_NEEDED, least)]
     kept.sort(key=lambda one: -one.gain)
     return [one for one in kept if one.gain > kept[0].gain - _LIKELY]
+
+
+def _judged(data: Mapping[str, _Data]) -> list[Tried]:
+    return [data[name].without for name in ("train", "validation")]
+
+
+def _law(data: Mapping[str, _Data]) -> LossLaw:
+    """Return the likeliest law without losses."""
+    size = data["train"].left.shape[1]
+    laws = [LossLaw(0.0, *some, size) for some in product(_SCATTER.tolist(), _SPOILED)]
+    return min(laws, key=lambda law: law.deviance(_judged(data)))
+
+
+def _all_found(data: Mapping[str, _Data], units: Sequence[Unit], base: LossLaw) -> list[Chance]:
+    found = [_found(data, unit, base) for unit in units]
+    return [one for one in found if one is not None]
+
+
+def _most(found: Sequence[Chance]) -> float:
+    return max((one.gain for one in found), default=0.0)
 
 
 def _single(unit: Unit) -> bool:
@@ -184,7 +212,7 @@ def _cut(prepared: Prepared) -> dict[str, _Data]:
         objective = prepared.mode.objective(
             prepared.predictor, prior, pieces, z=point.z, noise=prepared.noise
         )
-        found[name] = _Data(objective, point, objective([point])[0])
+        found[name] = _Data.of(objective, point)
     return found
 
 

@@ -63,9 +63,14 @@ class Scatter:
         return tuple(dict.fromkeys(chance.unit.name for chance in self.found))
 
     @property
+    def beside(self) -> bool:
+        """Whether what was found acts beside the effects of the search, not in their place."""
+        return bool(self.found) and self.found[0].beside
+
+    @property
     def groups(self) -> set[str]:
-        """The groups of what was found."""
-        return {chance.unit.effect.group for chance in self.found}
+        """The groups of what was found in the place of other effects."""
+        return set() if self.beside else {chance.unit.effect.group for chance in self.found}
 
     def measured(self, before: Shrinkage, generator: np.random.Generator) -> Shrinkage:
         """Return how far the gap shrinks with the likeliest, standardised by its own scatter."""
@@ -77,6 +82,8 @@ class Scatter:
         low, high = np.quantile(draws, [0.025, 0.975]).tolist()
         after = float(left.mean())
         share = [min((refit - value) / excess, 1.0) for value in (after, high, low)]
+        if self.beside:
+            return _further(before, *share)
         return replace(
             before,
             raw=max(before.raw, refit),
@@ -129,8 +136,16 @@ class Scatter:
             ),
         )
 
-    def findings(self, measured: Shrinkage, robot: Robot) -> tuple[Finding, ...]:
-        """Return the likeliest as the report has it."""
+    def findings(
+        self, measured: Shrinkage, robot: Robot, *, others: float = 0.0
+    ) -> tuple[Finding, ...]:
+        """Return the likeliest as the report has it.
+
+        Args:
+            measured: How far the gap shrinks.
+            robot: Whose effects they are.
+            others: The share that effects beside it have.
+        """
         first = self.found[0]
         half = 1.96 * first.error
         return (
@@ -141,7 +156,7 @@ class Scatter:
                 unit=unit_at(first.unit.effect, robot, int(np.argmax(first.unit.direction))),
                 ci95=(max(first.strength - half, 0.0), first.strength + half),
                 p_value=float(np.exp(-first.gain / 2)),
-                share_of_gap=measured.explained,
+                share_of_gap=max(measured.explained - others, 0.0),
                 strengths={first.unit.where: first.strength},
             ),
         )
@@ -192,3 +207,21 @@ class Scatter:
         if self.found or (self.holds and unit.name == SensorDropout.name):
             return "rejected"
         return "ruled_out" if np.isfinite(least) else "not_excited"
+
+
+def _further(before: Shrinkage, share: float, low: float, high: float) -> Shrinkage:
+    """Return how far the gap shrinks if such a share, with its interval, of what is left goes."""
+
+    def more(explained: float, of_rest: float) -> float:
+        return explained + max(1.0 - explained, 0.0) * max(of_rest, 0.0)
+
+    return replace(
+        before,
+        effects=min(before.effects, 1.0 + (before.effects - 1.0) * (1.0 - max(share, 0.0))),
+        explained=more(before.explained, share),
+        explained_ci=(more(before.explained_ci[0], low), more(before.explained_ci[1], high)),
+        remainder_ci=(
+            min(before.remainder_ci[0], before.remainder_ci[0] * (1.0 - max(high, 0.0))),
+            min(before.remainder_ci[1], before.remainder_ci[1] * (1.0 - max(low, 0.0))),
+        ),
+    )
