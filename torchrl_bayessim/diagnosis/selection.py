@@ -27,6 +27,7 @@ _SHARE = 0.1  # of the gap: what an effect that could be another must remove to 
 _REST = 0.5  # of what the base leaves: what any further effect must remove
 _REMAINS = 0.01  # of the gap: not worth another effect
 _WRONG = 1.5  # mean squared innovation of a base that something is missing from
+_SURELY, _NOTHING = 50.0, 0.2  # gain, and share of what the base leaves: it was just this
 _MOST = 4  # effects in one explanation
 _UNSEEN = 1.0  # a deviance that no test can detect
 _EXCHANGES = 3  # of effects for others in their places
@@ -220,6 +221,8 @@ def _identified(start: Model, base: Model, better: Model, models: Sequence[Model
     """
     if not base.units:
         return True
+    if _all_explained(start, base):
+        return False
     alone, before, after = (
         float(np.mean(np.r_[(m.fit.innovations**2).ravel(), (m.validation**2).ravel()]))
         for m in (start, base, better)
@@ -234,7 +237,8 @@ def _identified(start: Model, base: Model, better: Model, models: Sequence[Model
         for m in models
         if m is not better and as_good(better, m)
     ]
-    return before > _WRONG and all(groups <= added for groups in rivals)
+    just_this = gain(base, better) > _SURELY and after - 1.0 < _NOTHING * (before - 1.0)
+    return (before > _WRONG or just_this) and all(groups <= added for groups in rivals)
 
 
 def _eliminated(train: Objective, validation: Objective, model: Model) -> tuple[Model, list[Model]]:
