@@ -1,5 +1,6 @@
 """The command that tests the declared versions: what it pins, and that nothing is left out."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -26,6 +27,14 @@ def test_low_pins_every_lower_bound_and_high_none(versions):
         lower = line.split(",")[0].replace(">=", "==").replace("[hdf5]", "")
         assert lower in pins or line.startswith("torch>")
     assert list(versions.constraints("high", {})) == []
+
+
+def test_without_arguments_torch_is_taken_at_both_of_its_ends(versions):
+    (torch,) = [line for line in versions.PROJECT["dependencies"] if line.startswith("torch>")]
+    lower, _ = re.findall(r"[\d.]+", torch)
+    assert f"torch=={lower}" in versions.constraints("low", {})
+    assert not any(pin.startswith("torch=") for pin in versions.constraints("high", {}))
+    assert {"low", "high"} <= versions.ENVIRONMENTS.keys()
 
 
 def test_every_extra_has_its_environment_and_every_test_exists(versions):
