@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..effects.effect import Effect
 from ..effects.robot import Robot
 from .additions import groups, pairs, singles
 from .objective import Objective, Point, Unit, units_of
@@ -162,9 +163,9 @@ def _spread(fit: Fit, robot: Robot) -> list[Point]:
 def _everything(seen: Screen) -> dict[Unit, float]:
     """Return each effect at its best place and at all of its targets, and the better sign."""
     best = seen.best(1.0)
-    chosen: dict[tuple[str, bool], Unit] = {}
+    chosen: dict[tuple[Effect, bool], Unit] = {}
     for unit in best:
-        chosen.setdefault((unit.name, unit.where == "all"), unit)
+        chosen.setdefault((unit.effect, unit.where == "all"), unit)
     return {unit: float(np.sign(best[unit][1])) or 1.0 for unit in chosen.values()}
 
 
@@ -179,15 +180,16 @@ def _plain(fit: Fit) -> bool:
 
 
 def _promising(tried: Sequence[Fit]) -> list[Fit]:
-    """Return each effect's most promising fit, and the most promising of all.
+    """Return each effect's most promising fit, of each of its forms, and the most promising of all.
 
     Far from the truth one step promises little, to the right effect too.
     """
     order = sorted(tried, key=_promise)
-    first: dict[frozenset[str], Fit] = {}
+    first: dict[frozenset[Effect], Fit] = {}
+    fewest = min(len(_names(fit)) for fit in order)
     for fit in order:
-        if len(_names(fit)) == min(len(_names(other)) for other in order):
-            first.setdefault(_names(fit), fit)
+        if len(_names(fit)) == fewest:
+            first.setdefault(frozenset(unit.effect for unit in fit.units), fit)
     return [*first.values(), *(f for f in order[:_PROMISING] if f not in first.values())]
 
 
