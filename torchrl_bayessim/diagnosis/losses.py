@@ -154,14 +154,25 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
     # what the best explanation without chance gains by the same standard
     least = base.deviance(_judged(nominal)) - rival.deviance(_judged(best))
     found = _all_found(nominal, some, base)
-    kinds = {unit.effect.group for unit in selection.best.units}
-    if kinds and "timing" not in kinds:  # a lag of another form leaves what losses would
-        beside = [replace(one, beside=True) for one in _all_found(best, some, rival)]
+    if selection.best.units:
+        other = [unit for unit in some if not _akin(unit, selection.best.units)]
+        beside = [replace(one, beside=True) for one in _all_found(best, other, rival)]
         if _most(beside) > _most(found) - least + _NEEDED:
             found, least = beside, 0.0
     kept = [one for one in found if one.gain > max(_NEEDED, least)]
     kept.sort(key=lambda one: -one.gain)
     return [one for one in kept if one.gain > kept[0].gain - _LIKELY]
+
+
+def _akin(unit: Unit, others: Sequence[Unit]) -> bool:
+    """Return whether what losses would do may be another form of effects that are known.
+
+    As of a lag, or of what limits the commands.
+    """
+    return any(
+        other.effect.group == "timing" or other.effect.channel == unit.effect.channel
+        for other in others
+    )
 
 
 def _judged(data: Mapping[str, _Data]) -> list[Tried]:
