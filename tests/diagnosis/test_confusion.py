@@ -1,6 +1,7 @@
 """Which effects count as not told apart, on models with known misfits."""
 
 import numpy as np
+import pytest
 
 from torchrl_bayessim.diagnosis.confusion import confusion_set, rivals
 from torchrl_bayessim.diagnosis.model import Model
@@ -26,11 +27,11 @@ def model(square, *names):
     return Model(fit, left[SEGMENTS:], np.arange(2 * SEGMENTS))
 
 
-def selection(best, *tried):
+def selection(best, *tried, p_values=()):
     nominal = model(11.0)
     name = best.units[0].name
     others = tuple(m for m in tried if len(m.units) == 1)
-    return Selection(nominal, best, (), (), (nominal, best, *tried), {name: others})
+    return Selection(nominal, best, (), p_values, (nominal, best, *tried), {name: others})
 
 
 def test_what_is_clearly_worse_is_told_apart():
@@ -51,6 +52,21 @@ def test_what_acts_alike_and_explains_much_of_the_rest_is_not_told_apart():
     other = model(3.0, "coulomb_friction", "action_delay")
     found = selection(best, beside, other)
     assert confusion_set(found, "coulomb_friction") == ("coulomb_friction", "stribeck_friction")
+
+
+@pytest.mark.parametrize(
+    ("left", "expected"),
+    [(0.5, ("action_delay",)), (0.001, ("action_delay", "dead_band"))],
+    ids=["noise", "more than noise"],
+)
+def test_another_kind_that_explains_nearly_as_much_belongs_where_the_best_law_is_not_true(
+    left, expected
+):
+    best = model(1.0, "action_delay")
+    found = selection(
+        best, model(1.2, "dead_band"), model(1.6, "saturation"), p_values=(1e-9, left)
+    )
+    assert confusion_set(found, "action_delay") == expected
 
 
 def test_a_part_of_the_best_model_is_no_rival_of_it():

@@ -15,6 +15,8 @@ from .selection import Selection, parts
 
 _LAST = 0.01  # of what an effect explains: too little to prefer one law to another
 _FORM = 0.1  # of the same: how well the form of a law is known
+_OTHER = 0.03  # of the same, by a law of another kind, where the best is not the true one
+_MISSING = 0.01  # p-value of what a law leaves if it is the true one
 
 
 def confusion_set(selection: Selection, name: str) -> tuple[str, ...]:
@@ -28,11 +30,18 @@ def confusion_set(selection: Selection, name: str) -> tuple[str, ...]:
 
     Beside other effects, what acts like it is compared alone too, without their help: they were
     found next to it. What acts like it belongs to the set as well if it explains nearly as much, or
-    much of what the effect leaves: the cause may have neither's form. The first name is the
-    effect's own.
+    much of what the effect leaves: the cause may have neither's form. So does what acts otherwise,
+    where the best law leaves more than noise: then neither is the true one, and a little more
+    explained is no proof. The first name is the effect's own.
     """
     own = {unit.name for unit in selection.best.units}
     others = [stand_in(selection, rival) for rival in rivals(selection, name, form=_FORM)]
+    if len(own) == 1 and min(selection.p_values[1:], default=1.0) < _MISSING:
+        others += [
+            stand_in(selection, rival)
+            for rival in selection.alternatives.get(name, ())
+            if _short(selection, rival) < _OTHER
+        ]
     if len(own) > 1:
         others += _alike_alone(selection, name)
     others += _alike_beside(selection, name)
@@ -101,8 +110,13 @@ def _another_form(selection: Selection, rival: Model, name: str, *, form: float)
     best = selection.best
     mine = {u.effect.group for u in best.units if u.name == name}
     others = {u.effect.group for u in rival.units if u not in best.units}
-    more = float((rival.deviances() - best.deviances()).sum())
-    return mine == others and more < form * _explained(selection)
+    return mine == others and _short(selection, rival) < form
+
+
+def _short(selection: Selection, rival: Model) -> float:
+    """Return how much less a rival explains than the best, as a share of what that explains."""
+    more = float((rival.deviances() - selection.best.deviances()).sum())
+    return more / max(_explained(selection), 1e-9)
 
 
 def stand_in(selection: Selection, rival: Model) -> str:
