@@ -19,6 +19,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,7 @@ Array = NDArray[np.float64]
 Patterns = Sequence[tuple[bool, ...]]
 _STEPS = 8  # of a segment
 _TOGETHER = 3  # losses in a segment, at most
+_JUDGED = "train", "validation"  # splits that say what is lost
 _MOST = {"train": 90, "validation": 45, "test": 45}  # segments
 _SHARES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.25, 0.4, 0.6)  # s
 _SCATTER = np.geomspace(0.5, 4.0, 10)  # φ
@@ -133,6 +135,23 @@ class _Data:
             yield np.einsum("smt,st->sm", columns, error) + begin * start
 
 
+class _Alone(NamedTuple):
+    """The likeliest law without losses, its deviances, and the share of segments it gives up."""
+
+    law: LossLaw
+    costs: list[float]
+    spoiled: float
+
+    @classmethod
+    def of(cls, data: Mapping[str, _Data]) -> _Alone:
+        """Return that of training and validation segments."""
+        judged, size = [data[name].without for name in _JUDGED], data["train"].left.shape[1]
+        laws = [LossLaw(0.0, *some, size) for some in product(_SCATTER.tolist(), _SPOILED)]
+        law = min(laws, key=lambda law: law.deviance(judged))
+        told = Told.joined([law.told(one) for one in judged])
+        return cls(law, [law.deviance([one]) for one in judged], _spoiled(told))
+
+
 def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> list[Chance]:
     """Return the losses that explain what is wrong with the segments that have them.
 
@@ -148,12 +167,10 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
     if not some or type(prepared.mode) is not Mode:
         return []
     nominal = _cut(prepared)
-    base = _law(nominal)
     best = {n: _Data.of(one.objective, selection.best.fit.point) for n, one in nominal.items()}
-    rival = _law(best)
+    alone, rival = _Alone.of(nominal), _Alone.of(best)
     # what the best explanation without chance gains by the same standard
-    least = base.deviance(_judged(nominal)) - rival.deviance(_judged(best))
-    found = _all_found(nominal, some, base)
+    found, least = _all_found(nominal, some, alone), sum(alone.costs) - sum(rival.costs)
     if selection.best.units:
         other = [unit for unit in some if not _akin(unit, selection.best.units)]
         beside = [replace(one, beside=True) for one in _all_found(best, other, rival)]
@@ -175,24 +192,17 @@ def _akin(unit: Unit, others: Sequence[Unit]) -> bool:
     )
 
 
-def _judged(data: Mapping[str, _Data]) -> list[Tried]:
-    return [data[name].without for name in ("train", "validation")]
-
-
-def _law(data: Mapping[str, _Data]) -> LossLaw:
-    """Return the likeliest law without losses."""
-    size = data["train"].left.shape[1]
-    laws = [LossLaw(0.0, *some, size) for some in product(_SCATTER.tolist(), _SPOILED)]
-    return min(laws, key=lambda law: law.deviance(_judged(data)))
-
-
-def _all_found(data: Mapping[str, _Data], units: Sequence[Unit], base: LossLaw) -> list[Chance]:
-    found = [_found(data, unit, base) for unit in units]
+def _all_found(data: Mapping[str, _Data], units: Sequence[Unit], alone: _Alone) -> list[Chance]:
+    found = [_found(data, unit, alone) for unit in units]
     return [one for one in found if one is not None]
 
 
 def _most(found: Sequence[Chance]) -> float:
     return max((one.gain for one in found), default=0.0)
+
+
+def _spoiled(told: Told) -> float:
+    return float((told.spoiled > _LIKELIER).mean())
 
 
 def _single(unit: Unit) -> bool:
@@ -227,23 +237,19 @@ def _cut(prepared: Prepared) -> dict[str, _Data]:
     return found
 
 
-def _found(data: Mapping[str, _Data], unit: Unit, base: LossLaw) -> Chance | None:
+def _found(data: Mapping[str, _Data], unit: Unit, alone: _Alone) -> Chance | None:
     """Return the losses of a unit, nothing if they do not explain what they spoil."""
-    tried = {name: one.tried(unit) for name, one in data.items()}
-    judged = [tried[name] for name in ("train", "validation")]
+    tried, base = {name: one.tried(unit) for name, one in data.items()}, alone.law
+    judged = [tried[name] for name in _JUDGED]
     scatters = [s for s in _SCATTER.tolist() if s <= base.scatter][-3:]
     laws = [LossLaw(*some, base.size) for some in product(_SHARES, scatters, _SPOILED)]
     law = min(laws, key=lambda law: law.deviance(judged))
-    gains = [base.deviance([one.without]) - law.deviance([one]) for one in judged]
+    gains = [cost - law.deviance([one]) for cost, one in zip(alone.costs, judged, strict=True)]
     if sum(gains) < _NEEDED or gains[1] < -_LIKELY:
         return None
     told = {name: law.told(one) for name, one in tried.items()}
-    known = Told.joined([told["train"], told["validation"]])
-    spoiled = [
-        float((one.spoiled > _LIKELIER).mean())
-        for one in (known, Told.joined([base.told(one.without) for one in judged]))
-    ]
-    if law.scatter > _NOISE or spoiled[0] > max(_OTHERS, _REMAIN * spoiled[1]):
+    known = Told.joined([told[name] for name in _JUDGED])
+    if law.scatter > _NOISE or _spoiled(known) > max(_OTHERS, _REMAIN * alone.spoiled):
         return None  # something else is wrong everywhere, and may look like this
     concerned = known.lost > _LIKELIER
     excess = [float((one[concerned] - law.scatter).sum()) for one in (known.before, known.after)]
