@@ -1,6 +1,7 @@
 """A file is the old one or the new one, whoever is killed while writing it."""
 
 import ast
+import errno
 import os
 import signal
 import subprocess
@@ -98,6 +99,22 @@ def test_texts_are_all_written_or_none(file):
         write_texts({file: "new", file.with_name("page"): "new", file.with_name("folder"): "new"})
     assert [path.read_text() for path in (file, file.with_name("page"))] == ["old", "old"]
     assert len(list(file.parent.iterdir())) == 3
+
+
+@pytest.mark.parametrize("full", ["table.md", "page"])
+def test_texts_that_cannot_be_forced_to_disk_leave_all_old_ones(full, file, monkeypatch):
+    page = file.with_name("page")
+    write_texts({file: "old", page: "old"})
+
+    def fsync(number):
+        if f".{full}." in os.readlink(f"/proc/self/fd/{number}"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with pytest.raises(OSError, match="No space left"):
+        write_texts({file: "new", page: "new"})
+    assert [path.read_text() for path in (file, page)] == ["old", "old"]
+    assert set(file.parent.iterdir()) == {file, page}
 
 
 def test_data_are_forced_to_disk_before_the_rename_and_the_folder_after(file, monkeypatch):

@@ -55,21 +55,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         >>> file.read_bytes()
         b'half'
     """
-    path = Path(path).absolute()
-    if path.is_dir():  # said before anything is written
-        raise IsADirectoryError(message("a file to write", f"{path}, which is a folder"))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _sweep(path)
-    temporary = _beside(path)
-    try:
-        with temporary.open("xb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    _sync_folder(path.parent)
+    with _replacing([Path(path)]) as (file,):
+        yield file
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
@@ -92,6 +79,8 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 def write_texts(texts: Mapping[Path, str]) -> None:
     """Write texts to their files in UTF-8: none takes its place before all are on disk.
 
+    A kill between the renames leaves the first ones new and the others old, each of them whole.
+
     Raises:
         OSError: One cannot be written; what was there before stays, of the others too.
 
@@ -105,9 +94,9 @@ def write_texts(texts: Mapping[Path, str]) -> None:
         >>> [path.name for path in folder.iterdir()]
         ['page.html']
     """
-    with ExitStack() as files:
-        for path, text in texts.items():
-            files.enter_context(replacing(path)).write(text.encode())
+    with _replacing(list(texts)) as files:
+        for file, text in zip(files, texts.values(), strict=True):
+            file.write(text.encode())
 
 
 @contextmanager
@@ -148,6 +137,33 @@ def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     _sync_folder(path.parent)
+
+
+@contextmanager
+def _replacing(paths: list[Path]) -> Iterator[list[BinaryIO]]:
+    """Open files that take the places of ``paths``, in this order, when all are on disk."""
+    paths = [path.absolute() for path in paths]
+    for path in paths:
+        if path.is_dir():  # said before anything is written
+            raise IsADirectoryError(message("a file to write", f"{path}, which is a folder"))
+    with ExitStack() as left:
+        temporaries: list[Path] = []
+        with ExitStack() as opened:
+            files: list[BinaryIO] = []
+            for path in paths:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                _sweep(path)
+                temporaries.append(_beside(path))
+                left.callback(temporaries[-1].unlink, missing_ok=True)
+                files.append(opened.enter_context(temporaries[-1].open("xb")))
+            yield files
+            for file in files:
+                file.flush()
+                os.fsync(file.fileno())
+        for temporary, path in zip(temporaries, paths, strict=True):
+            temporary.replace(path)
+    for folder in {path.parent for path in paths}:
+        _sync_folder(folder)
 
 
 def _beside(path: Path) -> Path:
