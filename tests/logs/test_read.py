@@ -70,6 +70,12 @@ def test_malformed_csv_is_named(write, pendulum, text, match):
         read_logs(write(text), pendulum)
 
 
+def test_of_many_columns_the_first_by_name_that_is_there_twice_is_named(write, pendulum):
+    names = ",".join(f"c{number}" for number in range(100_000))
+    with pytest.raises(ValueError, match=r"each column once in log.csv, got 'c99998'"):
+        read_logs(write(f"{names},c99999,c99998\n1\n"), pendulum)
+
+
 def test_missing_logs_are_named(tmp_path, write, pendulum):
     with pytest.raises(ValueError, match="a folder or file of logs"):
         read_logs(tmp_path / "none", pendulum)

@@ -12,6 +12,7 @@ __all__ = ["Table", "dataset_tables", "read_csv", "read_parquet", "tensordict_ta
 
 import csv
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from importlib import import_module
@@ -296,7 +297,7 @@ def _check_count(rows: int, file: str) -> None:
 
 
 def _check_twice(header: list[str], file: str) -> None:
-    twice = sorted({name for name in header if header.count(name) > 1})
+    twice = sorted(name for name, count in Counter(header).items() if count > 1)
     if twice:
         raise ValueError(message(f"each column once in {file}", twice[0]))
 
