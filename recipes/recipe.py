@@ -121,11 +121,15 @@ def begun(settings: Settings, folder: Path) -> list[Path]:
     """
     path, resumable = folder / "settings.json", hasattr(settings, "resume")
     going_on = bool(getattr(settings, "resume", ""))
-    if not going_on and ((folder / "checkpoint.pt").exists() or (resumable and path.exists())):
+    try:
+        if not going_on and (folder / "checkpoint.pt").exists():
+            raise FileExistsError
+        if resumable:
+            write_text(path, noted(settings), new=not going_on)
+    except FileExistsError:
         hint = f"another out=, or resume={folder} to go on with that run"
-        raise ValueError(message("out= to be a folder without a run", str(folder), hint=hint))
-    if resumable:
-        write_text(path, noted(settings))
+        got = str(folder)
+        raise ValueError(message("out= to be a folder without a run", got, hint=hint)) from None
     return [path] if resumable and not going_on else []
 
 

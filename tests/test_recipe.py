@@ -5,7 +5,9 @@ import os
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Barrier
 
 import pytest
 
@@ -222,6 +224,32 @@ def test_a_folder_that_holds_a_run_is_not_taken_for_another(finished, refused):
         assert f"Try: another out=, or resume={folder}" in said
     assert "seed=0, as in the run to resume" in refused(f"resume={folder}", "seed=3")
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_of_runs_that_start_together_in_one_folder_one_goes_on(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(RECIPE.parent)
+    import recipe
+    import sim2real_ppo
+
+    both, exists = Barrier(2, timeout=60), Path.exists
+
+    def looked(path):
+        found = exists(path)
+        both.wait()  # neither has written yet
+        return found
+
+    def begin(seed):
+        try:
+            return recipe.begun(sim2real_ppo.Sim2Real(seed=seed), tmp_path)
+        except ValueError as error:
+            return str(error)
+
+    with monkeypatch.context() as patched, ThreadPoolExecutor(2) as pool:
+        patched.setattr(Path, "exists", looked)
+        started = list(pool.map(begin, range(2)))
+    (seed,) = (seed for seed in range(2) if started[seed] == [tmp_path / "settings.json"])
+    assert "out= to be a folder without a run" in started[1 - seed]
+    assert json.loads((tmp_path / "settings.json").read_text())["seed"] == seed
 
 
 @pytest.mark.parametrize("logger", ["wandb", "mlflow", "tensorboard"])

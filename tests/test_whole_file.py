@@ -92,6 +92,31 @@ def test_many_threads_write_one_file(file):
     assert list(file.parent.iterdir()) == [file]
 
 
+@pytest.mark.parametrize("links", [True, False])
+def test_of_many_writers_of_a_new_file_one_makes_it(links, file, monkeypatch):
+    def link(*_):
+        raise PermissionError(errno.EPERM, "Operation not permitted")  # as Linux says it
+
+    if not links:
+        monkeypatch.setattr(os, "link", link)
+    refused = []
+
+    def make(text):
+        try:
+            write_text(file, text, new=True)
+        except FileExistsError as error:
+            refused.append(str(error))
+            return None
+        return text
+
+    with ThreadPoolExecutor(8) as pool:
+        made = [text for text in pool.map(make, "abcdefgh") if text]
+    assert made == [file.read_text()]
+    assert len(refused) == 7
+    assert all("expected a file that does not exist yet, got '" in text for text in refused)
+    assert list(file.parent.iterdir()) == [file]
+
+
 def test_texts_are_all_written_or_none(file):
     write_texts({file: "old", file.with_name("page"): "old"})
     file.with_name("folder").mkdir()

@@ -11,7 +11,7 @@ import os
 import platform
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from glob import escape
 from pathlib import Path
@@ -59,10 +59,16 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         yield file
 
 
-def write_text(path: str | os.PathLike[str], text: str) -> None:
+def write_text(path: str | os.PathLike[str], text: str, *, new: bool = False) -> None:
     """Write ``text`` to ``path`` in UTF-8, wholly or not at all.
 
+    Args:
+        path: The file; replaced if it exists.
+        text: What it is to hold.
+        new: Replace nothing: of several writers at once, one makes the file.
+
     Raises:
+        FileExistsError: With ``new``, there is such a file.
         OSError: It cannot be written; what was there before stays.
 
     Example:
@@ -72,7 +78,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         >>> file.read_text(encoding="utf-8")
         '| θ |'
     """
-    with replacing(path) as file:
+    with _replacing([Path(path)], _name if new else os.replace) as (file,):
         file.write(text.encode())
 
 
@@ -140,7 +146,9 @@ def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 @contextmanager
-def _replacing(paths: list[Path]) -> Iterator[list[BinaryIO]]:
+def _replacing(
+    paths: list[Path], rename: Callable[[Path, Path], None] = os.replace
+) -> Iterator[list[BinaryIO]]:
     """Open files that take the places of ``paths``, in this order, when all are on disk."""
     paths = [path.absolute() for path in paths]
     for path in paths:
@@ -161,9 +169,23 @@ def _replacing(paths: list[Path]) -> Iterator[list[BinaryIO]]:
                 file.flush()
                 os.fsync(file.fileno())
         for temporary, path in zip(temporaries, paths, strict=True):
-            temporary.replace(path)
+            rename(temporary, path)
     for folder in {path.parent for path in paths}:
         _sync_folder(folder)
+
+
+def _name(temporary: Path, path: Path) -> None:
+    """Give a file its name, which a rename would take from another."""
+    try:
+        try:
+            os.link(temporary, path)
+        except FileExistsError:
+            raise
+        except OSError:  # a file system without links: alone too, but empty for a moment
+            path.touch(exist_ok=False)
+            temporary.replace(path)
+    except FileExistsError:
+        raise FileExistsError(message("a file that does not exist yet", str(path))) from None
 
 
 def _beside(path: Path) -> Path:
