@@ -11,6 +11,7 @@ RUNS, ROWS = 4, 160
 ALARMS = {  # what the gate finds with which a report is honest
     *("gap", "coarse_time", "fine_time", "jitter"),
     *("resolution", "constant_action", "constant_channel"),
+    *("position_jump", "velocity_spike", "no_actions"),  # as of an impact, or a free swing
 }
 
 

@@ -70,9 +70,9 @@ def measured_noise(
 
 def _pieces(logs: Sequence[Log], *, history: int) -> Segments:
     """Return the segments that noise is estimated on: enough to tell the calm ones, if possible."""
-    shortest = min(len(log) for log in logs) // 2
+    half = max(len(log) for log in logs) // 2  # what an impact has cut off may be a few rows
     for steps in (_STEPS, _FEWER):
-        pieces = cut(logs, min(steps, shortest), history=history, most=60, burn_in=history)
+        pieces = cut(logs, min(steps, half), history=history, most=60, burn_in=history)
         if len(pieces) >= ENOUGH:
             break
     return pieces

@@ -148,7 +148,25 @@ def _commands(
         place = {"file": record.name, "rows": (0, len(record) - 1), "severity": "error"}
         if correlation < -0.9:
             text = f"{joint} moves against its commands: opposite sign?"
+            if _beyond_resonance(log, number, actuator, model):
+                place["severity"] = "warning"
+                text = f"{joint} moves against its commands: too fast for it, or of opposite sign?"
             yield Finding(kind="action_sign", message=text, **place)
         elif correlation > 0.9 and abs(np.log(ratio / np.rad2deg(1.0))) < 0.3:
             text = f"commands of {joint} are {ratio:.3g} times its motion: in degrees?"
             yield Finding(kind="action_scale", message=text, **place)
+
+
+def _beyond_resonance(log: Log, joint: int, actuator: int, model: mujoco.MjModel) -> bool:
+    """Return whether commands change so fast that an undamped servo answers against them.
+
+    ``ω = rms(du/dt) / sd(u)``, against half of ``√(k / M)`` to leave room for other masses.
+    """
+    command, dof = log.ctrl[:, actuator].numpy(), int(model.jnt_dofadr[joint])
+    rate = np.sqrt(np.mean(np.gradient(command, log.time.numpy()) ** 2)) / command.std()
+    data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    data.qpos[:] = log.qpos[0].numpy()
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, inertia)
+    stiffness = -model.actuator_biasprm[actuator, 1] * model.actuator_gear[actuator, 0] ** 2
+    return bool(rate > 0.5 * np.sqrt(max(float(stiffness), 0.0) / inertia[dof, dof]))

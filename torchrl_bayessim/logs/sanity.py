@@ -26,7 +26,9 @@ from .system import System
 from .timestamps import check_time
 from .units import check_offsets
 
-_HONEST = {"push"}  # errors that happen to a robot, whose logs are as they should be
+# errors that happen to a robot whose logs are as they should be: an impact within a control step
+# is a jump, and who swings freely has no actions. What they name is left out
+_HONEST = {"push", "position_jump", "velocity_spike", "no_actions"}
 _MALFORMED = {"missing", "action_scale", "effort"}  # warnings of which that is not so
 
 
@@ -77,7 +79,7 @@ def check(records: Sequence[Record], system: System, *, horizon: int = 10) -> li
 
 
 def refuse_spoilt(findings: Sequence[Finding]) -> None:
-    """Refuse logs that are malformed: every error but a push, missing values, and odd units.
+    """Refuse logs that are malformed: errors that cannot happen to a robot, and missing values.
 
     Raises:
         ValueError: There are such findings; it names all of them, those of a kind together.

@@ -8,8 +8,9 @@ that this log's motion takes, and its *misfit* is what that leaves,
 .. math:: m = \frac{\operatorname{median} |y - \hat y|}
    {\operatorname{median} |y - c| + \operatorname{median} |\tau|} .
 
-A log is named where its misfit is far above that of the others and another unit or sign brings it
-down to theirs, so that no payload, friction or push is taken for a unit. Actions that never change
+A log is named where its misfit is near 1 and just one other unit or sign brings it down to that of
+the others, so that no payload, friction or push is taken for a unit: what many units would mend is
+no matter of units. Actions that never change
 are named where the motion takes about as much force as actuators exert in the other logs.
 """
 
@@ -43,7 +44,7 @@ from .system import System
 
 Array = NDArray[np.float64]
 _CLEAR = 3.0  # times what other logs leave
-_MISFIT = 0.4
+_MISFIT, _AGAINST = 0.5, 0.65  # of 1, where motion has nothing to do with actions, or is opposite
 _ANGLES = {np.pi / 180: "in degrees", 2 * np.pi: "in turns", -1.0: "of opposite sign"}
 _LENGTHS = {1e-3: "in thousandths", -1.0: "of opposite sign"}
 _ACTIONS = {1e-3: "in thousandths", 1e3: "in thousands", -1.0: "of opposite sign"}
@@ -128,10 +129,12 @@ def _unit(
     likely: dict[str, str] = {}
     for kind, text, log in _readings(one.log, joint, system):
         terms = dynamics(model, one.record, log, half).terms(dof)
+        if kind.endswith("_sign") and misfit < _AGAINST:
+            continue
         enough = min(misfit / 2, 1.5 * others.misfit + 0.05)
         if not _few(terms, half) and _misfit(terms, others.added) < enough:
             likely.setdefault(text, kind)
-    if likely:
+    if len(likely) == 1 or set(likely.values()) == {"motion_sign", "action_sign"}:
         text = f"{' or '.join(likely)}? Only so does {name} move as in the other logs"
         return next(iter(likely.values())), text
     still = np.ptp(one.log.ctrl.numpy(), axis=0).max(initial=0.0) == 0
