@@ -5,7 +5,7 @@ and their mean and covariance say little; but where it happened it can be seen. 
 every pattern of a few losses is tried (`loss_law`), and what must be beaten is the same law without
 losses, where some segments are spoiled by something else: losses have to explain what they spoil,
 and not only that some segments are worse than others. They are looked for in the place of the
-effects that the search found, and beside them.
+effects that the search found, and those of samples beside them.
 
 Effects of commands are linear in them over so few steps, so every pattern is made of one simulation
 per step; those of samples are the simulated values.
@@ -172,7 +172,7 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
     # what the best explanation without chance gains by the same standard
     found, least = _all_found(nominal, some, alone), sum(alone.costs) - sum(rival.costs)
     if selection.best.units:
-        other = [unit for unit in some if not _akin(unit, selection.best.units)]
+        other = [unit for unit in some if _apart(unit, selection.best.units)]
         beside = [replace(one, beside=True) for one in _all_found(best, other, rival)]
         if _most(beside) > _most(found) - least + _NEEDED:
             found, least = beside, 0.0
@@ -181,14 +181,15 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
     return [one for one in kept if one.gain > kept[0].gain - _LIKELY]
 
 
-def _akin(unit: Unit, others: Sequence[Unit]) -> bool:
-    """Return whether what losses would do may be another form of effects that are known.
+def _apart(unit: Unit, others: Sequence[Unit]) -> bool:
+    """Return whether losses beside effects could not be another form of those.
 
-    As of a lag, or of what limits the commands.
+    A force law that is not quite the true one errs as a command would that was lost, and a lag that
+    is not as samples would.
     """
-    return any(
-        other.effect.group == "timing" or other.effect.channel == unit.effect.channel
-        for other in others
+    samples = isinstance(unit.effect, SensorDropout)
+    return samples and not any(
+        other.effect.group == "timing" or other.effect.channel == "sensing" for other in others
     )
 
 
