@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["BayesSimError", "PhysicsError", "SimulationError", "message"]
+__all__ = ["BayesSimError", "PhysicsError", "SimulationError", "message", "printable"]
 
 import difflib
 from collections.abc import Iterable
@@ -20,6 +20,11 @@ class SimulationError(BayesSimError):
     """Simulations diverged, or none of them can be used."""
 
 
+def printable(text: str) -> str:
+    """Return a text without what would move a terminal's cursor or turn its direction."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
 def message(expected: str, got: object, *, available: Iterable[object] = (), hint: str = "") -> str:
     """Return the one-line message ``expected …, got …. Available: …. Try: …``.
 
@@ -32,7 +37,7 @@ def message(expected: str, got: object, *, available: Iterable[object] = (), hin
         "expected low < high for every bound, got 'low=2.0, high=1.0'. Try: swap them."
     """
     text = f"expected {expected}, got {got!r}."
-    names = [str(name) for name in available]
+    names = [printable(str(name)) for name in available]
     if names:
         near = difflib.get_close_matches(str(got), names, n=3, cutoff=0.6)
         rest = [name for name in names if name not in near]

@@ -62,7 +62,7 @@ class RayCollectors:
             ``max_restarts`` deaths of a worker, or ``max_task_retries`` in one question, it fails.
         timeout: Seconds after which a worker that has not answered a question (a share of the
             pairs, or a training batch) counts as dead: it is ended, begun anew and asked again.
-            ``None``: never.
+            ``None``: never. It must be longer than ``make`` takes, whose end is waited for.
 
     Raises:
         ImportError: Ray is not installed.

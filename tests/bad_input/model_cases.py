@@ -229,7 +229,7 @@ def bombs():
         "texture": '<asset><texture name="t" builtin="flat" width="9000" height="90000"/></asset>',
         "memory": '<size memory="1000G"/>',
         "user data": '<size nuserdata="2000000000"/>',
-        "keys": '<size nkey="2000000000"/>',
+        "keys": '<size nkey="50000"/>',
         "contacts": '<size njmax="2000000000" nconmax="2000000000"/>',
     }  # fmt: skip
     for name, part in sections.items():

@@ -18,7 +18,7 @@ from xml.etree.ElementTree import Element
 from ..errors import message
 
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
-_MOST_ELEMENTS = 100_000
+_MOST_ELEMENTS, _MOST_KEYS = 10_000, 10_000  # which take MuJoCo 10 s and 1 s to compile
 _MOST_VALUES = 100_000_000  # of a picture or a height field
 _MOST_SIZE = 1_000_000  # of an attribute of <size>
 _MOST_MEMORY = 4 << 30  # bytes of <size memory>
@@ -148,7 +148,8 @@ def _check_amount(element: Element, file: str) -> None:
     for key, value in element.attrib.items() if element.tag == "size" else ():
         unit = _UNITS.get(value.strip()[-1:].upper(), 0) if key == "memory" else 0
         amount = _numbers(value.strip()[:-1] if unit else value) * 2**unit
-        _limit(amount, _MOST_MEMORY if key == "memory" else _MOST_SIZE, key, file)
+        most = {"memory": _MOST_MEMORY, "nkey": _MOST_KEYS}.get(key, _MOST_SIZE)
+        _limit(amount, most, key, file)
 
 
 def _check_picture(path: Path) -> None:
