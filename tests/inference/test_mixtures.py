@@ -311,6 +311,31 @@ def test_other_dimensions_and_asymmetric_covariances_are_refused():
         divide(one, mean, -WIDE / 5, widest=WIDE)
 
 
+def test_parts_that_do_not_belong_together_are_refused():
+    one, mean = random_mixture(0), torch.zeros(2).double()
+    four, three = random_mixture(0, batch=(4,)), random_mixture(1, batch=(3,))
+    with pytest.raises(ValueError, match=r"batch shapes that broadcast, got \{'logits': \(3,\)"):
+        moment_match(four._replace(logits=three.logits))
+    with pytest.raises(ValueError, match=r"broadcast, got \{'the first mixture': \(4,\), 'the sec"):
+        multiply(four, three)
+    with pytest.raises(ValueError, match=r"broadcast, .*'the mean of the divisor': \(3,\)"):
+        divide(four, mean.expand(3, 2), WIDE / 5, widest=WIDE)
+    with pytest.raises(ValueError, match=r"one dtype, .*'logits': 'torch\.float32 on cpu'"):
+        reduce(one._replace(logits=one.logits.float()), 2)
+    with pytest.raises(ValueError, match=r"one dtype, .*'the second': 'torch\.float32 on cpu'"):
+        multiply(one, Mixture(*(part.float() for part in one)))
+    with pytest.raises(ValueError, match=r"one dtype, .*'widest': 'torch\.float32 on cpu'"):
+        divide(one, mean, WIDE / 5, widest=WIDE.float())
+    with pytest.raises(
+        ValueError, match=r"in floats of one dtype, .*'logits': 'torch\.int64 on cpu'"
+    ):
+        moment_match(Mixture(*(part.long() for part in one)))
+    with pytest.raises(ValueError, match=r"one widest, of shape \(2, 2\), got \(4, 2, 2\)"):
+        divide(four, mean, WIDE / 5, widest=WIDE.expand(4, 2, 2))
+    with pytest.raises(ValueError, match=r"one device, .*'loc': 'torch\.float64 on meta'"):
+        moment_match(one._replace(loc=one.loc.to("meta")))
+
+
 def test_a_mixture_is_reduced_to_one_component_or_more():
     one = random_mixture(0)
     with pytest.raises(ValueError, match="components to be positive, got 0"):

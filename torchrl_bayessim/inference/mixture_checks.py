@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-__all__ = ["check_covariance", "check_mixture", "first_marked"]
+__all__ = ["check_covariance", "check_mixture", "check_together", "first_marked"]
+
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -10,6 +12,31 @@ from torch import Tensor
 from ..errors import message
 
 _ROUNDING = 1e3  # times the precision of the numbers
+
+
+def check_together(parts: Mapping[str, tuple[Tensor, int]]) -> None:
+    """Refuse tensors of several dtypes or devices, or whose batch shapes do not broadcast.
+
+    Args:
+        parts: By name, each tensor and how many of its last dimensions are no batch.
+
+    Raises:
+        ValueError: So they are.
+    """
+    floats = all(part.is_floating_point() for part, _ in parts.values())
+    kinds = {name: f"{part.dtype} on {part.device}" for name, (part, _) in parts.items()}
+    if not floats or len(set(kinds.values())) > 1:
+        raise ValueError(
+            message(f"{', '.join(parts)} in floats of one dtype, on one device", kinds)
+        )
+    batches = {name: part.shape[: part.ndim - own] for name, (part, own) in parts.items()}
+    try:
+        torch.broadcast_shapes(*batches.values())
+    except RuntimeError:  # torch's, whose words differ between versions
+        got = {name: tuple(batch) for name, batch in batches.items()}
+        raise ValueError(
+            message(f"{', '.join(parts)} of batch shapes that broadcast", got)
+        ) from None
 
 
 def check_mixture(logits: Tensor, loc: Tensor, scale_tril: Tensor) -> None:
@@ -21,14 +48,16 @@ def check_mixture(logits: Tensor, loc: Tensor, scale_tril: Tensor) -> None:
         scale_tril: Shape ``(*, K, D, D)``.
 
     Raises:
-        ValueError: Shapes do not belong together, a number is not finite, all weights are 0, or a
-            factor is not lower triangular or has a negative diagonal.
+        ValueError: Shapes, dtypes (floats) or devices do not belong together, a number is not
+            finite, all weights are 0, or a factor is not lower triangular or has a negative
+            diagonal.
     """
     parts = [tuple(part.shape) for part in (logits, loc, scale_tril)]
     size = loc.shape[-2:]
     wrong = len(size) < 2 or logits.shape[-1:] != size[:1] or not size[1]
     if wrong or scale_tril.shape[-3:] != (*size, size[1]):
         raise ValueError(message("a mixture of shapes (*, K), (*, K, D), (*, K, D, D)", parts))
+    check_together({"logits": (logits, 1), "loc": (loc, 2), "scale_tril": (scale_tril, 3)})
     finite = (scale_tril @ scale_tril.mT).isfinite().flatten(-2).all(-1) & loc.isfinite().all(-1)
     odd = ~finite | logits.isnan() | logits.isposinf()
     if odd.any():

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from ..counts import check_count
 from ..errors import message
-from .mixture_checks import check_covariance, check_mixture, first_marked
+from .mixture_checks import check_covariance, check_mixture, check_together, first_marked
 
 _ROUNDING = 1e-9  # of the widest variance
 _THINNEST = 1e-12
@@ -97,8 +97,8 @@ def moment_match(mixture: Mixture) -> tuple[Tensor, Tensor]:
     the spread between the components included.
 
     Raises:
-        ValueError: A parameter is not finite, all weights are 0, or shapes and factors are those of
-            no mixture.
+        ValueError: A parameter is not finite, all weights are 0, or shapes, dtypes and factors are
+            those of no mixture.
     """
     check_mixture(*mixture)
     return _moments(mixture)
@@ -122,12 +122,14 @@ def multiply(first: Mixture, second: Mixture) -> Mixture:
     own deviation.
 
     Raises:
-        ValueError: As :func:`moment_match`, a mixture is a single point, or they have another D.
+        ValueError: As :func:`moment_match`, a mixture is a single point, or they differ in D, dtype
+            or device, or in batch shapes that do not broadcast.
     """
+    first, second = _spread_out(first), _spread_out(second)
     sizes = first.loc.shape[-1], second.loc.shape[-1]
     if sizes[0] != sizes[1]:
         raise ValueError(message(f"a second mixture of {sizes[0]} dimensions", sizes[1]))
-    first, second = _spread_out(first), _spread_out(second)
+    check_together({"the first mixture": (first.loc, 2), "the second": (second.loc, 2)})
     loc_1, loc_2 = torch.broadcast_tensors(first.loc.unsqueeze(-2), second.loc.unsqueeze(-3))
     cov_1, cov_2 = torch.broadcast_tensors(
         first.covariance.unsqueeze(-3), second.covariance.unsqueeze(-4)
@@ -167,8 +169,8 @@ def divide(mixture: Mixture, mean: Tensor, covariance: Tensor, *, widest: Tensor
 
     Raises:
         ValueError: As :func:`moment_match`, the dividend is a single point, the divisor or
-            ``widest`` has another D, or a covariance is asymmetric, or indefinite by more than
-            rounding.
+            ``widest`` has another D, dtype, device or batch shape, or a covariance is asymmetric,
+            or indefinite by more than rounding.
 
     Example:
         >>> wide = Mixture(torch.zeros(1), torch.zeros(1, 1), 2 * torch.ones(1, 1, 1))
@@ -178,12 +180,17 @@ def divide(mixture: Mixture, mean: Tensor, covariance: Tensor, *, widest: Tensor
         >>> round(quotient.mixture.covariance.item(), 4)
         8.0
     """
+    mixture = _spread_out(mixture)
+    given = {"the mixture": (mixture.loc, 2), "the mean of the divisor": (mean, 1)}
+    check_together({**given, "its covariance": (covariance, 2), "widest": (widest, 2)})
     size = mixture.loc.shape[-1]
     if mean.shape[-1:] != (size,):
         raise ValueError(message(f"a mean of the divisor of shape (*, {size})", tuple(mean.shape)))
     check_covariance("the covariance of the divisor", covariance, size)
     check_covariance("widest", widest, size)
-    mixture, scale_0 = _spread_out(mixture), _cholesky(covariance)
+    if widest.ndim != 2:
+        raise ValueError(message(f"one widest, of shape ({size}, {size})", tuple(widest.shape)))
+    scale_0 = _cholesky(covariance)
     if not mean.isfinite().all():
         raise ValueError(message("a finite mean of the divisor", mean.tolist()))
     if not mixture.scale_tril.diagonal(dim1=-2, dim2=-1).all():  # thin as a line or a sheet
