@@ -636,7 +636,7 @@ def test_simulations_that_diverge_are_counted_and_the_loop_goes_on():
         return torch.where(bad, torch.nan, together(rows)) if rows.ndim == 3 else together(rows)
 
     loop.statistics.together = sometimes
-    with pytest.warns(UserWarning, match="of 24 simulations are not finite: left out"):
+    with pytest.warns(UserWarning, match="of 24 pairs are not finite: left out"):
         (turn,) = loop
     assert 0 < turn.fit.dropped < 24
     assert turn.simulations == 24 - turn.fit.dropped
@@ -706,7 +706,7 @@ def test_simulations_that_give_nan_are_left_out_of_pairs_and_training(tmp_path):
     with pytest.warns() as said:
         (turn,) = loop
     texts = [str(warning.message) for warning in said]
-    assert any("of 48 simulations are not finite: left out" in text for text in texts)
+    assert any("of 48 pairs are not finite: left out" in text for text in texts)
     assert any("of 24 rows of a training batch hold NaN" in text for text in texts)
     assert 0 < turn.fit.dropped < 48
     assert turn.fit.pairs == 48 - turn.fit.dropped

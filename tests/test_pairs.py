@@ -92,7 +92,7 @@ def test_diverged_and_weighted_pairs_on_disk(both, tmp_path):
     pairs = both[0].clone()
     pairs["summary"][7] = torch.nan
     pairs["weight"] = torch.rand(len(pairs), generator=generator("weights"))
-    with pytest.warns(UserWarning, match="1 of 330 simulations are not finite: left out"):
+    with pytest.warns(UserWarning, match="1 of 330 pairs are not finite: left out"):
         one, _ = fitted(pairs)
     with pytest.warns(UserWarning, match="1 of 330"):
         other, _ = fitted(pairs.memmap(tmp_path))

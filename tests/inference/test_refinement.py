@@ -128,7 +128,7 @@ def test_simulations_that_diverge_are_dropped_counted_and_warned_about():
         return torch.where(theta[:, :1] > 0.5, torch.nan, inside(theta))
 
     made, asked = refinement(networks=2), []
-    with pytest.warns(UserWarning, match=r"\d+ of 300 simulations are not finite") as warned:
+    with pytest.warns(UserWarning, match=r"\d+ of 300 pairs are not finite") as warned:
         report = made.refine(
             lambda theta: asked.append(theta) or simulate(theta), torch.zeros(4), key=(0,)
         )

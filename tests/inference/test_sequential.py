@@ -177,7 +177,7 @@ def test_simulations_that_diverge_are_left_out_and_counted():
         return torch.where(theta > 1.9, torch.nan, theta**2)
 
     rounds = sequential(simulator, BOX, OBSERVED, rounds=1, simulations=400, **QUICK)
-    with pytest.warns(UserWarning, match="simulations are not finite"):
+    with pytest.warns(UserWarning, match="pairs are not finite"):
         (only,) = rounds
     assert 0 < only.fit.dropped < 40
     assert only.fit.pairs == 400 - only.fit.dropped

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 __all__ = ["PosteriorMaker", "average", "learn", "pairs_of", "real_summaries"]
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -48,10 +47,7 @@ def learn(
         seeds: Of the fits, one for each network.
         fit_options: Passed to :func:`.fit.fit`; a seed there takes the place of those above.
     """
-    pairs, dropped = usable_pairs(pairs)
-    if dropped:  # once, not once for each network
-        text = f"{dropped} of {dropped + len(pairs)} simulations are not finite: left out"
-        warnings.warn(text, stacklevel=3)
+    pairs, dropped = usable_pairs(pairs)  # once, not once for each network
     observed = observed.to(pairs["summary"])
     reports, members = [], []
     for seed in seeds:

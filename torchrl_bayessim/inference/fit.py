@@ -62,6 +62,8 @@ def usable_pairs(
 ) -> tuple[TensorDictBase, int]:
     """Return the pairs whose parameters and summaries are finite, and how many were dropped.
 
+    Warns of those, and says which of the two are not finite.
+
     Raises:
         ValueError: If there are no pairs, or one of the two entries is missing.
         SimulationError: If none is left.
@@ -77,20 +79,30 @@ def _usable_rows(data: TensorDictBase, *keys: NestedKey) -> Tensor:
             raise ValueError(message("pairs with an entry", str(key), available=found))
     if not data.batch_size.numel():
         raise ValueError(message("at least one pair", "none", hint="simulate some"))
-    good = torch.cat(
+    finite = torch.cat(
         [
-            torch.stack([data[part].get(key).isfinite().all(-1) for key in keys]).all(0)
+            torch.stack([data[part].get(key).isfinite().all(-1) for key in keys], -1)
             for part in parts(len(data))
         ]
     )
+    good = finite.all(-1)
+    if good.all():
+        return good.nonzero().flatten()
+    bad = zip(keys, (~finite).sum(0).tolist(), strict=True)
+    where = "NaN or infinity in " + " and ".join(f"{key} of {rows}" for key, rows in bad if rows)
+    if not finite[:, 0].any():
+        expected, hint = f"finite parameters in {keys[0]!r}", "parameters as they were drawn"
+        raise SimulationError(message(expected, f"{where} of {len(good)} pairs", hint=hint))
     if not good.any():
         raise SimulationError(
             message(
                 "at least one simulation with finite summaries",
-                f"{len(good)} diverged simulations of {len(good)}",
+                f"{len(good)} diverged simulations of {len(good)}: {where}",
                 hint="a smaller prior, a smaller time step, or a summary that masks the divergence",
             )
         )
+    text = f"{int((~good).sum())} of {len(good)} pairs are not finite: left out ({where})"
+    warnings.warn(text, stacklevel=3)
     return good.nonzero().flatten()
 
 
@@ -117,7 +129,7 @@ def fit(
 
     AdamW with one cycle of the learning rate: see :mod:`.descent`. After every epoch the loss on
     held-out pairs is computed, and the parameters of the best epoch are kept. Pairs that are not
-    finite are dropped and counted; those of weight 0 are left out.
+    finite are dropped, counted and warned of; those of weight 0 are left out.
 
     Warns if no statistic varies, so that there is nothing to learn, and of statistics that are
     scaled by their quartiles because a few pairs lie absurdly far out: see :mod:`.input_scaling`.
@@ -159,10 +171,7 @@ def fit(
     keys = (posterior.theta_key, posterior.summary_key)
     data = data.select(*keys, "weight", strict=False)
     rows = _usable_rows(data, *keys)
-    if dropped := len(data) - len(rows):
-        warnings.warn(
-            f"{dropped} of {len(data)} simulations are not finite: left out", stacklevel=2
-        )
+    dropped = len(data) - len(rows)
     rows = _check_pairs(posterior, Rows(data, rows))
     order = rows[torch.randperm(len(rows), generator=generator(seed, "split"))]
     held_out = min(max(1, round(validation_fraction * len(rows))), len(rows) - 2, _HELD_OUT)
