@@ -31,6 +31,7 @@ LAYERS = [
         "simulate",
         "ray_collectors",
         "ray_probe",
+        "ray_waiting",
         "ray_worker",
         "real_trajectories",
         "robots",

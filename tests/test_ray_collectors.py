@@ -218,11 +218,13 @@ def test_logs_are_replayed_on_ray_as_here(collectors):
 def test_a_recipe_simulates_on_ray(cluster, tmp_path):
     recipe = Path(__file__).parent.parent / "recipes" / "sim2real_ppo.py"
     short = ["short=true", "progress=false", "rounds=1", "episodes=2", "simulations=48"]
-    results = []
+    begun, results = [], []
     for kind in ("direct", "ray"):
         given = [*short, "baseline=false", f"collector={kind}", f"out={tmp_path / kind}"]
         command = [sys.executable, "-W", "ignore", str(recipe), *given]
-        subprocess.run(command, check=True, capture_output=True, timeout=120)
+        begun.append(subprocess.Popen(command, stdout=subprocess.DEVNULL))
+    for kind, process in zip(("direct", "ray"), begun, strict=True):
+        assert process.wait(timeout=120) == 0
         results.append(json.loads((tmp_path / kind / "result.json").read_text()))
     for name in ("posterior_mean", "posterior_sd", "log_prob_true", "frames"):
         here, there = (result["rounds"][0][name] for result in results)
@@ -268,6 +270,53 @@ def test_a_worker_that_cannot_begin_says_why(cluster):
     policy, few = learner().policy, {"num_cpus": 0}
     with pytest.raises(SimulationError, match="ModuleNotFoundError: no simulator here"):
         RayCollectors(missing, policy, environments=N, steps=STEPS, workers=1, worker=few)
+
+
+def test_a_worker_whose_environment_is_never_made_is_not_waited_for(cluster):
+    def endless(environments):
+        time.sleep(1000)
+
+    given = {"environments": N, "steps": STEPS, "workers": 1, "worker": {"num_cpus": 0}}
+    said = r"begin within timeout=0\.5 seconds, got '1 of 1 that have not'.*does make\(\) end"
+    with pytest.raises(SimulationError, match=said):
+        RayCollectors(endless, learner().policy, timeout=0.5, **given)
+
+
+DEATH = """
+import os, signal, sys, threading, time
+from pathlib import Path
+import ray
+from torchrl_bayessim.ray_waiting import Waiting
+
+def kill():
+    for file in Path("/proc").glob("[0-9]*/stat"):
+        name, rest = file.read_text().split("(", 1)[1].rsplit(")", 1)
+        if name == "raylet" and int(rest.split()[1]) == os.getpid():
+            os.kill(int(file.parent.name), signal.SIGKILL)
+
+ray.init(num_cpus=1, object_store_memory=100 * 2**20, include_dashboard=False)
+waiting = Waiting(ray, 60.0)
+class Sleeper:
+    def sleep(self, seconds):
+        time.sleep(seconds)
+
+asked = ray.remote(Sleeper).remote().sleep.remote(waiting.put(60))
+threading.Timer(2.0, kill).start()
+for ask in (lambda: waiting.answers({asked: None}), lambda: waiting.put(0)):
+    try:
+        ask()
+    except Exception as error:
+        print(type(error).__name__, error, flush=True)
+os._exit(0)  # rather than wait for what is dead
+"""
+
+
+def test_the_death_of_ray_itself_is_told(cluster):
+    command = [sys.executable, "-W", "ignore", "-c", DEATH]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    told = [line for line in ended.stdout.splitlines() if line.startswith("Sim")]
+    assert len(told) == 2
+    assert all("SimulationError expected Ray's node manager on this m" in line for line in told)
 
 
 def test_what_cannot_be_done_is_refused(cluster, collectors):
@@ -363,7 +412,8 @@ class Sleeping:
 def test_a_worker_that_hangs_is_ended_and_its_share_simulated_again(
     collectors, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(collectors, "_timeout", 8.0)  # time for one that is begun anew
+    monkeypatch.setattr(collectors._waiting, "timeout", 1.0)  # less than a start takes
+    monkeypatch.setattr(collectors._waiting, "start", 3.5)
     before = set(workers())
     there = pairs(SummaryStatistics(Sleeping(tmp_path)), collectors=collectors)
     assert (tmp_path / "slept").exists()

@@ -32,6 +32,7 @@ from .errors import SimulationError, message
 from .kinds import check_function, check_kind
 from .pairs import counted
 from .ray_probe import difference, probed, probing
+from .ray_waiting import Waiting
 from .ray_worker import Block, Inference, RayWorker, described
 from .scalars import check_number
 from .summaries import SummaryStatistics
@@ -62,7 +63,8 @@ class RayCollectors:
             ``max_restarts`` deaths of a worker, or ``max_task_retries`` in one question, it fails.
         timeout: Seconds after which a worker that has not answered a question (a share of the
             pairs, or a training batch) counts as dead: it is ended, begun anew and asked again.
-            ``None``: never. It must be longer than ``make`` takes, whose end is waited for.
+            ``None``: never. The first start of the workers must not take longer either; a later
+            one is not counted, up to twice the time of the first.
 
     Raises:
         ImportError: Ray is not installed.
@@ -70,8 +72,9 @@ class RayCollectors:
             no mapping.
         ValueError: A number is not positive, W does not divide N, N T is beyond 10⁸, Ray does not
             know an option, the cluster has too few processors, or an environment has no randomizer.
-        SimulationError: A worker cannot begin or, in a call, died too often. What a worker raises
-            is raised here.
+        SimulationError: A worker cannot begin, or not within ``timeout``; in a call: one died or
+            was ended too often, or Ray's own process on this machine died. What a worker raises is
+            raised here.
 
     Example::
 
@@ -119,7 +122,6 @@ class RayCollectors:
         if timeout is not None:
             check_number("timeout", timeout, above=0.0)
         self.environments, self.steps, self.workers = environments, steps, workers
-        self._timeout = timeout
         self._alike: WeakKeyDictionary[EnvBase, int] = WeakKeyDictionary()
         self._block: tuple[Any, DomainRandomizer] | None = None
         self._there: dict[str, str] | None = None  # what the workers' environments are
@@ -129,6 +131,7 @@ class RayCollectors:
         with ExitStack() as undo:
             undo.callback(self._end_cluster)
             self._check_processors(needs["num_cpus"])
+            self._waiting = Waiting(self._ray, timeout)
             self._collector = self._begun(make, policy, needs)
             undo.pop_all()
 
@@ -143,12 +146,21 @@ class RayCollectors:
         """Return TorchRL's collector of the workers."""
         from torchrl.collectors.distributed import RayCollector
 
+        waiting = self._waiting
+
+        class Begun(RayCollector):
+            """TorchRL's, which waits without end for workers to begin, after those that do."""
+
+            def add_collectors(self, *given: Any, **named: Any) -> None:
+                super().add_collectors(*given, **named)
+                waiting.begun(self.remote_collectors)
+
         options = {
             "whole": partial(make, self.environments),
             "auto_register_policy_transforms": False,
         }
         with self._errors():
-            return RayCollector(
+            return Begun(
                 [partial(make, self.environments // self.workers)] * self.workers,
                 UndisturbedPolicy(policy),
                 collector_class=RayWorker,  # pyright: ignore[reportArgumentType]
@@ -213,7 +225,7 @@ class RayCollectors:
             expected = "parameters theta of shape (N, D), at least one row"
             raise ValueError(message(expected, tuple(theta.shape)))
         asked = Inference(policy, statistics, trajectories, steps, key, prepare)
-        question = self._ray.put(asked)
+        question = self._waiting.put(asked)
         batches = trajectories // math.gcd(self.environments, trajectories)  # end with a pair
         pairs = batches * self.environments // trajectories
         shares = range(0, len(theta), pairs)
@@ -302,7 +314,7 @@ class RayCollectors:
         known = state["episodes"][: self.environments]
         episodes[: len(known)] = known
         block = Block(randomizer.source, state["seed"], episodes, key)
-        self._block, self._weights = (self._ray.put(block), randomizer), []
+        self._block, self._weights = (self._waiting.put(block), randomizer), []
 
     def batch(self, policy: TensorDictModuleBase) -> TensorDictBase:
         """Return the next batch ``[N, T]``, collected with the policy as it is now.
@@ -315,7 +327,7 @@ class RayCollectors:
         if self._block is None:
             raise RuntimeError(message("begin() before the first batch", "none"))
         block, randomizer = self._block
-        self._weights.append(self._ray.put(dict(policy.state_dict())))
+        self._weights.append(self._waiting.put(dict(policy.state_dict())))
         answers = self._ask("collect", [(block, list(self._weights))] * self.workers)
         episodes = torch.cat([counted for _, counted in answers])
         randomizer.set_extra_state({**randomizer.get_extra_state(), "episodes": episodes})
@@ -346,19 +358,7 @@ class RayCollectors:
                 worker.cascade_execute.remote(method, *given)
                 for worker, given in zip(workers, arguments, strict=True)
             ]
-            self._end_hanging(dict(zip(answers, workers, strict=True)))
-            return self._ray.get(answers)
-
-    def _end_hanging(self, waiting: dict[Any, Any]) -> None:
-        """Wait for answers; end workers that take too long, which Ray then begins anew."""
-        while waiting:
-            done, late = self._ray.wait(
-                list(waiting), num_returns=len(waiting), timeout=self._timeout, fetch_local=False
-            )
-            for answer in done:
-                del waiting[answer]
-            for answer in late:
-                self._ray.kill(waiting[answer], no_restart=False)
+            return self._waiting.answers(dict(zip(answers, workers, strict=True)))
 
     @contextmanager
     def _errors(self) -> Iterator[None]:
@@ -375,11 +375,12 @@ class RayCollectors:
                 message("workers without errors", lines[-1], hint=hint)
             ) from error
         except errors.RayActorError as error:
-            lines = str(error).strip().splitlines()
+            lines, ended = str(error).strip().splitlines(), self._waiting.ended
+            slow = f" ({ended} were ended: no answer within timeout={self._waiting.timeout})"
             raise SimulationError(
                 message(
                     "workers that begin and live",
-                    f"{lines[0]} {lines[-1]}",
+                    f"{lines[0]} {lines[-1]}" + slow * bool(ended),
                     hint="is what make() needs installed there, and memory enough? Does a "
                     "simulator crash?",
                 )
