@@ -19,6 +19,7 @@ from scipy.ndimage import maximum_filter1d
 
 from .columns import joint_names
 from .finding import Finding, runs
+from .glitches import beyond_all
 from .record import Record, plausible, unwrapped, wraps
 from .system import System
 
@@ -104,6 +105,11 @@ def _findings(motion: Motion, time: Array) -> Iterator[Found]:
             marked = np.append(turns, False)
             yield "wrap", marked, f"{turns.sum()} jump(s) of a turn, undone", "warning"
             motion = motion._replace(position=unwrapped(motion.position))
+    if (wrong := beyond_all(motion.position)).any():
+        text = f"{wrong.sum()} row(s) far beyond all others, out and back at once"
+        yield "glitch", wrong, text, "error"
+        mended = np.interp(time, time[~wrong], motion.position[~wrong])
+        motion = motion._replace(position=mended)
     yield from _repeats(motion, time)
     if motion.velocity is None:
         yield from _glitches(motion.position)

@@ -29,7 +29,7 @@ from .units import check_offsets
 # errors that happen to a robot whose logs are as they should be: an impact within a control step
 # is a jump, and who swings freely has no actions. What they name is left out
 _HONEST = {"push", "position_jump", "velocity_spike", "no_actions"}
-_MALFORMED = {"missing", "action_scale", "effort"}  # warnings of which that is not so
+_MALFORMED = {"missing", "action_scale", "effort", "no_motion"}  # warnings of which that is not so
 
 
 def check(records: Sequence[Record], system: System, *, horizon: int = 10) -> list[Finding]:
@@ -165,6 +165,8 @@ def _resolution(records: Sequence[Record], system: System) -> Iterator[Finding]:
                 if values is not None and plausible(values).all():
                     pair = lattice_step(values), float(np.ptp(values))
                     steps.setdefault(f"{motion.name}{name}", []).append(pair)
+    if steps and not any(span for pairs in steps.values() for _, span in pairs):
+        yield _general("no_motion", "no position or velocity changes in any log: nothing moves")
     for name, pairs in steps.items():
         step, span = np.median(pairs, axis=0)
         if max(span for _, span in pairs) == 0:

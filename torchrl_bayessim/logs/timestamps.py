@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from .finding import Finding, runs
 from .record import Record
 
+_DAY = 86400.0  # seconds
+_SET = 1e3  # times all other rows together, that a clock is ahead which was set, and no gap
 _UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
@@ -57,6 +59,11 @@ def check_time(record: Record, control_dt: float) -> Iterator[Finding]:
         text = f"{len(gaps)} gap(s) between rows, the longest of {longest:.3g} s"
         place = int(rows[gaps[0]]), int(rows[gaps[-1] + 1])
         yield Finding(kind="gap", file=record.name, rows=place, message=text)
+    ahead = np.flatnonzero((steps > _DAY) & (steps > _SET * (steps.sum() - steps)))
+    if len(ahead):
+        marked = np.isin(np.arange(last + 1), [rows[ahead], rows[ahead + 1]])
+        text = f"the time jumps by {steps[ahead[0]]:.3g} s: was the clock set?"
+        yield from _rows(record, marked, "clock_set", text)
     jitter = np.abs(steps / usual - 1)
     if np.mean(jitter > 0.2) > 0.05:
         text = f"{np.mean(jitter > 0.2):.0%} of the steps differ from the usual by over a fifth"
