@@ -1,5 +1,6 @@
 """Commands and samples that are lost now and then are found one by one."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from test_chance import lost
 from test_diagnose import logs, system
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.loss_law import LossLaw, Tried, likeliest
 
 SOME = ("action_delay", "action_jitter", "packet_drop", "sensor_dropout", "coulomb_friction")
 
@@ -108,3 +110,29 @@ def test_nothing_is_lost_where_commands_are_late_in_a_way_that_no_effect_has():
 
     report = diagnose(system(), None, logs(8, act=smeared), effects=(*SOME, "action_lag"))
     assert not {effect.name for effect in report.effects} & {"packet_drop", "sensor_dropout"}
+
+
+def test_the_likeliest_law_of_a_grid_is_the_one_of_least_deviance_by_the_definition():
+    rng = np.random.default_rng(3)
+    lost = np.array([0, 1, 1, 1, 2, 2, 2])
+    parts = [Tried(rng.chisquare(12, (7, n)) / 6, lost, values=3) for n in (20, 11)]
+    shares, scatters, spoiled = (0.02, 0.2, 0.5), (1.0, 1.7, 3.0), (0.01, 0.2)
+
+    def deviance(law):
+        total = 0.0
+        for part in parts:
+            s, phi = law.share, law.scatter
+            prior = s**lost * (1 - s) ** (3 - lost)
+            normal = (phi * np.exp(part.squares / phi)) ** (-0.5 * law.size)
+            wide = [
+                (k * phi * np.exp(part.squares[0] / (k * phi))) ** (-0.5 * law.size)
+                for k in (4.0, 16.0, 64.0, 256.0)
+            ]
+            density = (1 - law.spoiled) * prior @ normal + law.spoiled * np.mean(wide, 0)
+            total -= 2 * np.log(density).sum()
+        return total
+
+    laws = [LossLaw(*some, size=12) for some in itertools.product(shares, scatters, spoiled)]
+    for law in laws:
+        assert law.deviance(parts) == pytest.approx(deviance(law), rel=1e-12)
+    assert likeliest(parts, shares, scatters, spoiled, size=12) == min(laws, key=deviance)

@@ -10,10 +10,11 @@ The second part is of segments that something else has spoiled, such as a contac
 
 from __future__ import annotations
 
-__all__ = ["LossLaw", "Told", "Tried"]
+__all__ = ["LossLaw", "Told", "Tried", "likeliest"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,7 +93,8 @@ class LossLaw:
 
     def deviance(self, parts: Sequence[Tried]) -> float:
         """Return ``-2 Σ log p`` over all segments."""
-        return -2.0 * sum(float(np.sum(logsumexp(self._logs(p), axis=0))) for p in parts)
+        grid = [self.share], [self.scatter], [self.spoiled]
+        return float(_deviances(parts, *grid, size=self.size).item())
 
     def told(self, tried: Tried) -> Told:
         """Return what segments say of their losses."""
@@ -111,11 +113,72 @@ class LossLaw:
         prior = np.add(
             xlogy(tried.lost, self.share), xlog1py(tried.values - tried.lost, -self.share)
         )
-        own = self._normal(tried.squares, self.scatter)
+        own = _normal(tried.squares, np.array(self.scatter), self.size)
         own += (np.log1p(-self.spoiled) + prior)[:, None]
-        wide = self._normal(tried.squares[:1], self.scatter * _WIDER[:, None])
-        mean = logsumexp(wide, axis=0, keepdims=True) - np.log(len(_WIDER))
-        return np.concatenate([own, np.log(self.spoiled) + mean])
+        wide = _wide(tried, np.array(self.scatter), self.size)
+        return np.concatenate([own, np.log(self.spoiled) + wide[None]])
 
-    def _normal(self, squares: Array, variance: float | Array) -> Array:
-        return -0.5 * self.size * (squares / variance + np.log(variance))
+
+def likeliest(
+    parts: Sequence[Tried],
+    shares: Sequence[float],
+    scatters: Sequence[float],
+    spoiled: Sequence[float],
+    *,
+    size: int,
+) -> LossLaw:
+    """Return the law of a grid under which segments are likeliest.
+
+    Args:
+        parts: Segments under every pattern of losses.
+        shares: Values of ``s``.
+        scatters: Values of ``φ``.
+        spoiled: Values of ``η``.
+        size: ``M``.
+
+    Example:
+        >>> tried = Tried(np.array([[1.0, 9.0], [9.0, 1.0]]), np.array([0, 1]), values=5)
+        >>> likeliest([tried], [0.0, 0.1, 0.6], [1.0, 4.0], [0.01], size=20).share
+        0.1
+    """
+    laws = [LossLaw(*some, size) for some in product(shares, scatters, spoiled)]
+    return laws[int(_deviances(parts, shares, scatters, spoiled, size=size).argmin())]
+
+
+def _deviances(
+    parts: Sequence[Tried],
+    shares: Sequence[float],
+    scatters: Sequence[float],
+    spoiled: Sequence[float],
+    *,
+    size: int,
+) -> Array:
+    """Return ``-2 Σ log p`` of every law of a grid, one axis per parameter.
+
+    Patterns of as many losses share their prior: their densities are added up once for all ``s``.
+    """
+    share, scatter, eta = (np.asarray(values)[:, None] for values in (shares, scatters, spoiled))
+    total = np.zeros((len(shares), len(scatters), len(spoiled)))
+    for tried in parts:
+        normal = _normal(tried.squares, scatter[..., None], size)
+        counts = np.unique(tried.lost)
+        each = [_total(normal[:, tried.lost == count], axis=1) for count in counts]
+        prior = xlogy(counts, share) + xlog1py(tried.values - counts, -share)
+        own = _total(np.stack(each, 1) + prior[:, None, :, None], axis=2)[:, :, None]
+        wide = _wide(tried, scatter, size)[:, None]
+        total += np.logaddexp(np.log1p(-eta) + own, np.log(eta) + wide).sum(-1)
+    return -2.0 * total
+
+
+def _wide(tried: Tried, scatter: Array, size: int) -> Array:
+    """Return the log density of spoiled segments, for scatters of shape ``(*, 1)`` or ``()``."""
+    wide = _normal(tried.squares[0], scatter[..., None] * _WIDER[:, None], size)
+    return _total(wide, axis=-2) - np.log(len(_WIDER))
+
+
+def _total(logs: Array, *, axis: int) -> Array:
+    return np.asarray(logsumexp(logs, axis=axis))
+
+
+def _normal(squares: Array, variance: Array, size: int) -> Array:
+    return -0.5 * size * (squares / variance + np.log(variance))

@@ -18,7 +18,7 @@ __all__ = ["losses"]
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations, product
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from ..effects.action import PacketDrop
 from ..effects.sensors import SensorDropout
 from .chance import Chance
-from .loss_law import LossLaw, Told, Tried
+from .loss_law import LossLaw, Told, Tried, likeliest
 from .modes import Mode
 from .objective import Objective, Point, Unit, strengths_of
 from .preparation import Prepared
@@ -146,8 +146,7 @@ class _Alone(NamedTuple):
     def of(cls, data: Mapping[str, _Data]) -> _Alone:
         """Return that of training and validation segments."""
         judged, size = [data[name].without for name in _JUDGED], data["train"].left.shape[1]
-        laws = [LossLaw(0.0, *some, size) for some in product(_SCATTER.tolist(), _SPOILED)]
-        law = min(laws, key=lambda law: law.deviance(judged))
+        law = likeliest(judged, (0.0,), _SCATTER.tolist(), _SPOILED, size=size)
         told = Told.joined([law.told(one) for one in judged])
         return cls(law, [law.deviance([one]) for one in judged], _spoiled(told))
 
@@ -243,8 +242,7 @@ def _found(data: Mapping[str, _Data], unit: Unit, alone: _Alone) -> Chance | Non
     tried, base = {name: one.tried(unit) for name, one in data.items()}, alone.law
     judged = [tried[name] for name in _JUDGED]
     scatters = [s for s in _SCATTER.tolist() if s <= base.scatter][-3:]
-    laws = [LossLaw(*some, base.size) for some in product(_SHARES, scatters, _SPOILED)]
-    law = min(laws, key=lambda law: law.deviance(judged))
+    law = likeliest(judged, _SHARES, scatters, _SPOILED, size=base.size)
     gains = [cost - law.deviance([one]) for cost, one in zip(alone.costs, judged, strict=True)]
     if sum(gains) < _NEEDED or gains[1] < -_LIKELY:
         return None
