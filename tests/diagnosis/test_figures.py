@@ -13,7 +13,7 @@ from torchrl_bayessim.diagnosis.figures import figures
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.preparation import prepare
 from torchrl_bayessim.diagnosis.selection import select
-from torchrl_bayessim.diagnosis.shrinkage import shrinkage
+from torchrl_bayessim.diagnosis.shrinkage import Shrinkage, shrinkage
 from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.inference.priors import BoxPrior
@@ -110,6 +110,20 @@ def test_all_of_the_gap_is_never_sure(searched):
     low, high = measured.explained_ci
     assert 0.9 < low < measured.explained <= high <= 1.0
     assert low < 0.9999
+
+
+@pytest.mark.parametrize(
+    ("own", "elsewhere"),
+    [
+        ((0.85, 0.92), (0.75, 0.96)),
+        ((0.9, 0.9), (0.89, 0.91)),
+        ((0.4, 1.0), (0.0, 1.0)),
+        ((-0.2, 0.95), (-0.2, 1.0)),
+    ],
+)
+def test_the_share_explained_is_less_sure_for_motions_that_were_not_recorded(own, elsewhere):
+    measured = Shrinkage(9.0, 5.0, 1.4, 0.9, own, (3.5, 4.5), (0.2, 0.6))
+    assert measured.elsewhere == pytest.approx(elsewhere)
 
 
 def test_they_are_plain_numbers(drawn):

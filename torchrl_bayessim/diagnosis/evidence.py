@@ -112,7 +112,7 @@ def assemble(
         with_effects=measured.effects,
         floor=1.0,
         explained_fraction=measured.explained,
-        ci95=measured.explained_ci,
+        ci95=measured.elsewhere,
         by_parameters=(measured.raw - measured.refit) / max(measured.raw - 1.0, 1e-9),
         rollout_rmse=rollouts,
     )

@@ -119,7 +119,8 @@ class Gap:
         with_effects: With the effects too.
         floor: Of a perfect simulator.
         explained_fraction: ``(refit - with_effects) / (refit - floor)`` on the test split.
-        ci95: Its interval, by bootstrap over trajectories.
+        ci95: Its interval for motions that were not recorded: by bootstrap over trajectories, and
+            wider by what robots whose cause was known had.
         by_parameters: ``(raw - refit) / (raw - floor)``.
         rollout_rmse: Open-loop error over whole test runs, by channel, SI units.
     """

@@ -179,7 +179,7 @@ def _sentence(
         text = f"{gap} It is real, but {found}."
         return f"{text}{place}{parameters}{untested}"
     causes = ", and ".join(_described(e) for e in effects)
-    low, high = measured.explained_ci
+    low, high = measured.elsewhere
     share = f"explains {_percent(measured.explained)} [{100 * low:.0f}, {100 * high:.0f}] of it"
     if validated is not None:
         share = f"explains {_percent(validated)} of it on validation runs, test runs hardly show it"
