@@ -124,6 +124,19 @@ def test_replay_does_what_the_transform_does_on_hopper(name):
     assert worst(task, log, unit, 0.1 * unit.high) < 1e-4
 
 
+def test_contacts_of_named_pairs_alone_are_seen():
+    falling = """<mujoco><worldbody>
+      <geom name="floor" type="plane" size="1 1 1" contype="0" conaffinity="0"/>
+      <body pos="0 0 .12"><joint name="rail" type="slide" axis="0 0 1"/>
+        <geom name="foot" size=".1" mass="1" contype="0" conaffinity="0"/></body></worldbody>
+      <actuator><motor joint="rail" ctrlrange="-1 1"/></actuator>
+      <contact><pair geom1="floor" geom2="foot"/></contact></mujoco>"""
+    task = Task(model=mujoco.MjModel.from_xml_string(falling), frame_skip=5)
+    log = recorded(task)
+    assert log.qpos[-1, 0] > -0.1  # held by the floor, whose top it reaches at -0.02
+    assert worst(task, log) < 1e-12
+
+
 def test_nothing_is_left_of_its_own_simulation():
     assert worst(arm(), recorded(arm())) < 1e-5
 

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from types import SimpleNamespace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -96,7 +97,7 @@ class Forcing:
                 else:
                     name = _WHERE[kind]
                     if name not in added:
-                        shape = torch.broadcast_shapes(value.shape, now.velocity.shape)[:-1]
+                        shape = np.broadcast_shapes(value.shape, now.velocity.shape)[:-1]
                         added[name] = value.new_zeros(*shape, self._nv)
                     added[name][..., self._dofs] += value
         return added, after

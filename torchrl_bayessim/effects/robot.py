@@ -10,6 +10,7 @@ from __future__ import annotations
 __all__ = ["Robot", "robot_of"]
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -76,6 +77,22 @@ class Robot:
         if self.model is None:
             raise ValueError(message("a robot with a MuJoCo model", "none", hint="robot_of(task)"))
         return self.model
+
+    @cached_property
+    def actuator_limits(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The largest force, the no-load speed and the gear of each actuator, shape ``(A,)``.
+
+        Force and speed in the actuator's own coordinate.
+        """
+        model = self.require_model()
+        gear = torch.from_numpy(model.actuator_gear[:, 0].copy())
+        force = torch.from_numpy(model.actuator_gainprm[:, 0]).abs() * self.command_scale
+        # a servo is rarely further than a fifth of its range from its target
+        force = torch.where(torch.from_numpy(model.actuator_biastype) != 0, 0.2 * force, force)
+        limited = torch.from_numpy(model.actuator_forcelimited).bool()
+        range_ = torch.from_numpy(model.actuator_forcerange).abs().amax(-1)
+        speed = self.velocity_scale[list(self.joint_of_actuator)] * gear.abs()
+        return torch.where(limited, range_, force), speed, gear
 
 
 def robot_of(task: Task) -> Robot:

@@ -73,24 +73,6 @@ def _change(force: Tensor, now: Now) -> Mapping[str, Tensor]:
     return {"command": (force - now.actuator_force) / now.actuator_gain}
 
 
-def _limits(now: Now) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the largest force, the no-load speed and the gear of each actuator.
-
-    Force and speed in the actuator's own coordinate.
-    """
-    robot = now.robot
-    model = robot.require_model()
-    gear = torch.from_numpy(model.actuator_gear[:, 0])
-    force = torch.from_numpy(model.actuator_gainprm[:, 0]).abs() * robot.command_scale
-    # a servo is rarely further than a fifth of its range from its target
-    force = torch.where(torch.from_numpy(model.actuator_biastype) != 0, 0.2 * force, force)
-    limited = torch.from_numpy(model.actuator_forcelimited).bool()
-    range_ = torch.from_numpy(model.actuator_forcerange).abs().amax(-1)
-    force = torch.where(limited, range_, force)
-    speed = _at_actuators(robot.velocity_scale, robot) * gear.abs()
-    return force.to(now.command), speed.to(now.command), gear.to(now.command)
-
-
 class TorqueSpeedLimit(_Transmission):
     """A motor loses torque with speed: ``|F| ≤ F_max clip(1.2 − s |v| / v_max, 0.05, 1)``.
 
@@ -112,7 +94,7 @@ class TorqueSpeedLimit(_Transmission):
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
         """Return the change of commands."""
-        largest, fastest, _ = _limits(now)
+        largest, fastest, _ = now.robot.actuator_limits
         speed = now.actuator_velocity / fastest
         share = (1.2 - strength * speed.abs()).clamp(0.05, 1.0)
         limited = now.actuator_force.clamp(-share * largest, share * largest)
@@ -166,7 +148,7 @@ class Backlash(_Transmission):
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
         """Return the change of commands."""
-        largest, fastest, gear = _limits(now)
+        largest, fastest, gear = now.robot.actuator_limits
         force, half = now.actuator_force, strength / 2
         side = (force * gear).sign()
         gap = filled(memory["gap"], side * half)
