@@ -72,12 +72,13 @@ def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> No
     name = Path(sys.argv[0]).stem
     start = time.monotonic()
     made: list[Path] = []
+    alone = False
     try:
         settings = parse(settings_type, sys.argv[1:])
         torch.set_num_threads(settings.threads)
         folder = Path(settings.out or f"outputs/{name}/{datetime.now():%Y-%m-%d_%H-%M-%S}")
         made = opened(folder)
-        made = [*begun(settings, folder), *made]
+        made, alone = [*begun(settings, folder), *made], True
         result = job(settings, folder)
         result["provenance"] = provenance(settings, seconds=time.monotonic() - start)
         text = json.dumps(plain(result))
@@ -85,7 +86,7 @@ def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> No
             {folder / "settings.json": noted(settings), folder / "result.json": f"{text}\n"}
         )
     except _EXPECTED as error:
-        leave(made)
+        leave(made, within=alone)
         if debugging(sys.argv[1:]):
             raise
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
@@ -98,19 +99,27 @@ def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> No
 
 
 def opened(folder: Path) -> list[Path]:
-    """Make a folder where there is none; return what was made, the innermost first.
+    """Make a folder where there is none; return what this run made, the innermost first.
 
     Raises:
         ValueError: It cannot be made.
     """
+    made: list[Path] = []
     try:
-        missing = [path for path in (folder, *folder.parents) if not path.exists()]
-        folder.mkdir(parents=True, exist_ok=True)
+        for path in reversed([folder, *folder.parents]):
+            try:
+                if not path.exists():
+                    path.mkdir()
+                    made = [path, *made]
+            except FileExistsError:  # another run has just made it
+                pass
+        folder.mkdir(exist_ok=True)  # which says so where it is a file
     except (OSError, ValueError) as error:  # ValueError: a name with NUL
+        leave(made, within=False)
         reason = getattr(error, "strerror", None) or error
         got = f"{str(folder)[:200]}: {reason}"
         raise ValueError(message("out= to be a folder to write to", got)) from None
-    return missing
+    return made
 
 
 def begun(settings: Settings, folder: Path) -> list[Path]:
@@ -133,15 +142,20 @@ def begun(settings: Settings, folder: Path) -> list[Path]:
     return [path] if resumable and not going_on else []
 
 
-def leave(made: list[Path]) -> None:
-    """Remove what was made for a run, where the job wrote no file beside it."""
+def leave(made: list[Path], *, within: bool) -> None:
+    """Remove what was made for a run, where the job wrote no file beside it.
+
+    Args:
+        made: Files and folders.
+        within: Whether what is in the folders is this run's too.
+    """
     noted = [path for path in made if path.is_file()]
     for path in noted:
         written = (file for file in path.parent.rglob("*") if file.is_file())
         if all(file == path for file in written):
             path.unlink()
     for path in made:
-        folders = [inner for inner in path.rglob("*") if inner.is_dir()]
+        folders = [inner for inner in path.rglob("*") if within and inner.is_dir()]
         for folder in [*sorted(folders, reverse=True), path]:  # innermost first; the empty ones
             with suppress(OSError):
                 folder.rmdir()

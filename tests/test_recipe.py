@@ -252,6 +252,27 @@ def test_of_runs_that_start_together_in_one_folder_one_goes_on(tmp_path, monkeyp
     assert json.loads((tmp_path / "settings.json").read_text())["seed"] == seed
 
 
+def test_who_loses_leaves_the_folders_of_the_other_run(tmp_path, monkeypatch, refused):
+    monkeypatch.syspath_prepend(RECIPE.parent)
+    import recipe
+
+    begun = recipe.begun
+
+    def other_first(settings, folder):
+        (folder / "empty" / "inner").mkdir(parents=True)
+        (folder / "settings.json").write_text("{}")
+        return begun(settings, folder)
+
+    monkeypatch.setattr(recipe, "begun", other_first)
+    assert "out= to be a folder without a run" in refused(f"out={tmp_path / 'run'}")
+    assert (tmp_path / "run" / "empty" / "inner").is_dir()
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "exists", lambda path: False)  # as before the other made them
+        assert recipe.opened(tmp_path / "run" / "empty" / "mine") == [
+            tmp_path / "run" / "empty" / "mine"
+        ]
+
+
 @pytest.mark.parametrize("logger", ["wandb", "mlflow", "tensorboard"])
 def test_a_logger_without_its_package_is_refused(logger, refused, monkeypatch):
     import sim2real_ppo
