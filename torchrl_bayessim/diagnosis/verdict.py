@@ -27,14 +27,14 @@ from .preparation import Prepared
 from .report import Candidate, Finding, Verdict
 from .selection import Selection
 from .shrinkage import Shrinkage
+from .validation import NAMED, SHOWN, enough, hardly_shown, share_on_validation
 
 _NEGLIGIBLE = 0.05  # of the noise floor: an excess that no one would chase
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
-_SHOWN = 1.2  # mean squared innovation of runs that show a gap
 _CERTAIN = 1e-15  # p-value of a gap that is too small to be seen at a glance
 _MOST = 0.5  # of the joints without measured velocity
 _NOISE_AGAIN = 2.0  # mean squared innovation: as much again as the noise
-_ALL, _NAMED, _PARTIAL = 0.98, 0.8, 0.4
+_ALL, _PARTIAL = 0.98, 0.4
 
 
 def conclude(
@@ -58,14 +58,17 @@ def conclude(
     significant = selection.p_values[0] <= alpha or bool(scattered)
     splits = [float((m**2).mean()) for m in
               (selection.nominal.fit.innovations, selection.nominal.validation)]  # fmt: skip
-    visible = measured.excess_ci[0] > 0 and min(measured.refit, *splits) > _UNEXPLAINED
+    visible = measured.excess_ci[0] > 0 and (
+        min(measured.refit, *splits) > _UNEXPLAINED
+        or (measured.refit > SHOWN and selection.p_values[0] < _CERTAIN)
+    )
     # of a large gap, 2 % may be ten times the noise: proof that the law is another one
     nearly_all = measured.explained >= _ALL and measured.effects <= _NOISE_AGAIN
     left = measured.remainder_ci[0] > _NEGLIGIBLE and not nearly_all
-    validated = _validated(selection)
+    validated = share_on_validation(selection)
     perhaps_nothing = measured.explained_ci[0] <= 0 and validated < _PARTIAL and not scattered
     unsaid = measured.explained < _PARTIAL or perhaps_nothing
-    elsewhere = unsaid and _hardly_shown(measured) and validated >= _NAMED
+    elsewhere = unsaid and hardly_shown(measured) and validated >= enough(selection.p_values[0])
     verdict: Verdict
     if not _excited(system, prepared):
         verdict = "not_testable"
@@ -88,7 +91,7 @@ def conclude(
         verdict = "named_partial" if elsewhere else "unknown" if sure else "none"
     elif len(groups) > 1 and len(confused) > 1:
         verdict = "ambiguous"
-    elif measured.explained >= _NAMED and not left:
+    elif measured.explained >= NAMED and not left:
         verdict = "named"
     else:
         verdict = "named_partial"
@@ -109,23 +112,6 @@ def conclude(
         ),
         alarms,
     )
-
-
-def _hardly_shown(measured: Shrinkage) -> bool:
-    """Return whether test runs show so little of the gap that they cannot say what explains it."""
-    low, high = measured.explained_ci
-    return measured.refit < _SHOWN or (low <= 0 and high >= _NAMED)
-
-
-def _validated(selection: Selection) -> float:
-    """Return the share of the gap that the effects explain on validation runs, 0 if they have none.
-
-    They were chosen there too, so it flatters them.
-    """
-    before, after = (
-        float((model.validation**2).mean()) for model in (selection.nominal, selection.best)
-    )
-    return min((before - after) / (before - 1.0), 1.0) if before > _SHOWN else 0.0
 
 
 def _excited(system: System, prepared: Prepared) -> bool:

@@ -1,0 +1,45 @@
+"""Where test runs hardly show a gap, validation runs may, if they do so surely."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
+from torchrl_bayessim.diagnosis.validation import enough, hardly_shown, share_on_validation
+
+
+def on_validation(before, after, values=2000):
+    """Return a search that found effects with these mean squared innovations."""
+    models = [SimpleNamespace(validation=np.full((20, values // 20), g**0.5))
+              for g in (before, after)]  # fmt: skip
+    return SimpleNamespace(nominal=models[0], best=models[1])
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "values", "share"),
+    [
+        (3.0, 1.5, 2000, 0.75),
+        (3.0, 0.9, 2000, 1.0),
+        (1.1, 0.95, 2000, 1.0),  # the floor is lower than it was thought
+        (1.1, 1.02, 2000, 0.8),
+        (1.1, 0.95, 200, 0.0),  # as chance does in so few
+        (1.0, 1.0, 2000, 0.0),
+        (0.9, 1.1, 2000, 0.0),
+    ],
+)
+def test_the_share_is_of_what_is_above_the_floor(before, after, values, share):
+    assert share_on_validation(on_validation(before, after, values)) == pytest.approx(share)
+
+
+@pytest.mark.parametrize(
+    ("refit", "interval", "hardly"),
+    [(1.1, (0.0, 0.1), True), (5.0, (-0.5, 0.9), True), (5.0, (0.1, 0.5), False)],
+)
+def test_test_runs_that_exclude_most_of_the_gap_say_so(refit, interval, hardly):
+    measured = Shrinkage(9.0, refit, 1.0, 0.05, interval, (0.0, 9.0), (0.0, 1.0))
+    assert hardly_shown(measured) is hardly
+
+
+def test_a_doubtful_gap_needs_a_larger_share():
+    assert enough(1e-12) < enough(0.01)

@@ -1,0 +1,41 @@
+"""What validation runs say of the effects where test runs hardly show the gap.
+
+Effects were chosen on them too, which flatters the share: so it must be larger, or surer.
+"""
+
+from __future__ import annotations
+
+__all__ = ["NAMED", "SHOWN", "enough", "hardly_shown", "share_on_validation"]
+
+from .selection import Selection
+from .shrinkage import Shrinkage
+
+NAMED = 0.8  # share of the gap that a cause without reserve explains
+SHOWN = 1.2  # mean squared innovation of runs that show a gap
+_SURE, _LARGELY = 1e-5, 0.6  # p-value of the gap, and the share that is then enough
+_GONE = 50.0  # squares that are surely not of chance
+
+
+def enough(p_value: float) -> float:
+    """Return the share on validation runs that names a cause, for a gap of this p-value."""
+    return _LARGELY if p_value < _SURE else NAMED
+
+
+def hardly_shown(measured: Shrinkage) -> bool:
+    """Return whether test runs show so little of the gap that they cannot say what explains it."""
+    return measured.refit < SHOWN or measured.explained_ci[1] >= NAMED
+
+
+def share_on_validation(selection: Selection) -> float:
+    """Return the share of the gap that the effects explain on validation runs, 0 if they have none.
+
+    ``(G_without - G_with) / (G_without - 1)`` of mean squared innovations, and of a gap that is
+    hardly above the noise floor, but surely smaller with the effects, the same above what they
+    leave: chaos may have set the floor too high.
+    """
+    without, left = (model.validation**2 for model in (selection.nominal, selection.best))
+    before, after = float(without.mean()), float(left.mean())
+    if before > SHOWN:
+        return min((before - after) / (before - 1.0), 1.0)
+    gone = float((without - left).sum()) > _GONE
+    return (before - after) / (before - min(after, 1.0)) if gone else 0.0
