@@ -205,7 +205,7 @@ def test_disturbances():
     ripple = forces("cogging", 2.0, number=4, qpos=0.2)
     assert ripple["qfrc_applied"] == pytest.approx([2 * math.sin(0.8)] * 4)
     robot = arm()
-    assert effect("cogging").bounds(robot)[1][2:].tolist() == [0.0, 0.0]  # slides
+    assert (effect("cogging").bounds(robot)[1] > 0).all()  # slides too
 
 
 def test_a_motor_loses_torque_with_speed_where_it_drives_only():

@@ -16,6 +16,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,7 +36,7 @@ SHAPED = (PeriodicDisturbance.name, Cogging.name, ActionQuantization.name)
 _STEPS = 6  # control steps over which a force is taken to be constant
 _MOST = 400  # segments
 _SLOWEST = 0.5  # cycles per log: slower ones are trends
-_NUMBERS = np.arange(2, 25)  # cogs per turn; one is gravity's
+_NUMBERS = np.arange(2.0, 25.0)  # cogs per turn; one is gravity's
 _CLEAR = 0.1  # share of the force's variance that a sine or a step must explain
 _FINEST, _GRID = 0.02, 600  # of the largest step that is plausible; steps tried
 
@@ -64,27 +65,43 @@ def shaped(
     time, spacing = pieces.time[:, middle], _STEPS * system.control_dt
     span = float(np.mean([len(log) for log in logs])) * system.control_dt
     frequencies = np.arange(_SLOWEST / span, 0.5 / spacing, 0.125 / span)
+    window = slice(pieces.history, pieces.history + _STEPS)
+    dof_joints = system.task.model.dof_jntid[list(system.robot.dof_index)]
     units: list[Unit] = []
     for i, push in enumerate(pushes):
-        position = pieces.qpos[:, middle, system.robot.qpos_index[push.joint(system.robot)]]
+        joint = push.joint(system.robot)
+        positions = pieces.qpos[:, window, system.robot.qpos_index[joint]]
         found: list[Effect] = []
         best = _sine(force[:, i], 2 * np.pi * time, frequencies)
         if best is not None:
             found.append(PeriodicDisturbance(frequency=best[0], phase=best[1]))
-        best = _sine(force[:, i], position, _NUMBERS.astype(np.float64))
+        sliding = system.task.model.jnt_type[dof_joints[joint]] == mujoco.mjtJoint.mjJNT_SLIDE
+        rates = _waves(positions) if sliding else _NUMBERS
+        best = _sine(force[:, i], positions[:, _STEPS // 2], rates)
         if best is not None:
-            found.append(Cogging(number=round(best[0]), phase=best[1]))
+            found.append(Cogging(number=best[0], phase=best[1]))
         units += [u for u in units_of(found, system.robot) if u.where == push.where]
     for unit in units_of([ActionQuantization()], system.robot):
         joint, actuator = unit.joint(system.robot), unit.direction.index(1.0)
         column = next((i for i, p in enumerate(pushes) if p.joint(system.robot) == joint), None)
         if joint < 0 or column is None or unit.where == "all":
             continue
-        window = slice(pieces.history, pieces.history + _STEPS)
         step = _rounding(force[:, column], pieces.ctrl[:, window, actuator], unit.high)
         if step is not None:  # the screen's higher level is the step itself
             units.append(replace(unit, high=step / LEVELS[-1]))
     return units
+
+
+def _waves(positions: Array) -> Array:
+    """Return rates over a slide's position, rad/m, of positions ``(S, T)`` of short segments.
+
+    From half a period over all that it travels to half a period within a segment.
+    """
+    travel, within = float(np.ptp(positions)), float(np.median(np.ptp(positions, axis=1)))
+    if within <= 0:
+        return np.zeros(0)
+    slowest = np.pi / travel
+    return np.arange(slowest, np.pi / within, 0.25 * slowest)[:_GRID]
 
 
 def _rounding(force: Array, commands: Array, most: float) -> float | None:

@@ -10,8 +10,6 @@ __all__ = ["Cogging", "ConstantForce", "PeriodicDisturbance"]
 import math
 from collections.abc import Mapping
 
-import mujoco
-import torch
 from torch import Tensor
 
 from .effect import ForceEffect, Memory, Now
@@ -61,36 +59,28 @@ class PeriodicDisturbance(ForceEffect):
 
 
 class Cogging(ForceEffect):
-    """A force that oscillates with a hinge's angle: ``s sin(k q + φ)``; up to 15 % of ``F_max``.
+    """A force that oscillates with a joint's position: ``s sin(k q + φ)``; up to 15 % of ``F_max``.
 
     Args:
-        number: ``k``, periods per turn.
+        number: ``k``, periods per turn of a hinge, or per 2π m of a slide.
         phase: ``φ``, rad.
     """
 
     name, unit, group = "cogging", "N m", "disturbance"
 
-    def __init__(self, number: int = 6, phase: float = 0.0) -> None:
+    def __init__(self, number: float = 6, phase: float = 0.0) -> None:
         self.number, self.phase = number, phase
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
-        """Return the joints' names, none if there is no hinge."""
-        return robot.joints if bool(_hinges(robot).any()) else ()
+        """Return the joints' names."""
+        return robot.joints
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
-        """Return 0 and 0.15 ``F_max``, or 0 for slides."""
-        return within(robot.force_scale * _hinges(robot), 0.0, 0.15)
+        """Return 0 and 0.15 ``F_max``."""
+        return within(robot.force_scale, 0.0, 0.15)
 
     def forces(
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
         """Return the force at this angle."""
         return {"force": strength * (self.number * now.position + self.phase).sin()}, memory
-
-
-def _hinges(robot: Robot) -> Tensor:
-    model = robot.model
-    if model is None:
-        return torch.ones(len(robot.joints), dtype=torch.bool)
-    types = [int(model.jnt_type[model.dof_jntid[dof]]) for dof in robot.dof_index]
-    return torch.tensor([t == int(mujoco.mjtJoint.mjJNT_HINGE) for t in types])
