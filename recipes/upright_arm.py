@@ -17,7 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEnv, UnaryTransform
 
-from torchrl_bayessim.diagnosis.excitations import excitations
+from torchrl_bayessim.diagnosis.excitation_library import excitations
 from torchrl_bayessim.effects.catalogue import CATALOGUE
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.envs.task import Readings, Task, uniform_reset

@@ -23,7 +23,7 @@ from torch import Tensor
 from .envs.components import check_counts, finite_rows, names_of
 from .envs.draws import Draws
 from .envs.model_batch import ModelBatch
-from .envs.segments import checked_actions, copies, substeps_of, vectors
+from .envs.recorded import checked_actions, copies, substeps_of, vectors
 from .envs.stepper import Stepper
 from .envs.task import Readings, Task
 from .envs.tasks.catalogue import as_task

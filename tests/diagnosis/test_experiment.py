@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchrl_bayessim.diagnosis.excitations import excitations
+from torchrl_bayessim.diagnosis.excitation_library import excitations
 from torchrl_bayessim.diagnosis.experiment import _discrimination
 from torchrl_bayessim.diagnosis.objective import Point
 from torchrl_bayessim.diagnosis.refit import Fit

@@ -23,8 +23,8 @@ from ..logs.log import Log
 from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
 from ..physics.mujoco import MujocoPhysics
+from .assembly import assemble
 from .chance import chances, detectable, of_chance
-from .evidence import assemble
 from .holds import bridged
 from .losses import losses
 from .modes import MODES

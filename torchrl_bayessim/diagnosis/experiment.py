@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ..logs.log import Log
 from .confusion import rivals, stand_in
-from .excitations import excitations
+from .excitation_library import excitations
 from .objective import Objective, Point, Unit, strengths_of
 from .preparation import Prepared
 from .refit import Fit, refit

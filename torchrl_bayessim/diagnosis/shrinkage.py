@@ -7,12 +7,10 @@ the parameters alone gains is the parameters' credit.
 
 from __future__ import annotations
 
-__all__ = ["Shrinkage", "shares", "shrinkage"]
+__all__ = ["Shrinkage", "shrinkage"]
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
-from math import factorial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,25 +125,3 @@ def _interval(values: Array) -> tuple[float, float]:
         return (0.0, 0.0)
     low, high = np.quantile(values, [0.025, 0.975])
     return float(low), float(high)
-
-
-def shares(names: Sequence[str], value: Callable[[frozenset[str]], float]) -> dict[str, float]:
-    """Return each member's credit, averaged over all orders of joining (Shapley 1953).
-
-    Example:
-        >>> credit = shares(["a", "b"], lambda s: {0: 0.0, 1: 0.3, 2: 1.0}[len(s)])
-        >>> credit
-        {'a': 0.5, 'b': 0.5}
-    """
-    count = len(names)
-    credit = {}
-    for name in names:
-        others = [n for n in names if n != name]
-        total = 0.0
-        for size in range(count):
-            weight = factorial(size) * factorial(count - size - 1) / factorial(count)
-            for some in combinations(others, size):
-                with_it = value(frozenset([*some, name]))
-                total += weight * (with_it - value(frozenset(some)))
-        credit[name] = total
-    return credit

@@ -1,0 +1,333 @@
+"""From a finished search to a report: figures on the test runs, the verdict, and its reasons."""
+
+from __future__ import annotations
+
+__all__ = ["assemble"]
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..effects.effect import Effect
+from ..effects.robot import Robot
+from ..effects.sensors import SensorDropout
+from ..effects.units import unit_at
+from ..logs.sanity import Finding as SanityFinding
+from ..logs.system import System
+from .candidates import candidates, strength_errors
+from .confusion import confusion_set, settled
+from .credit import credit_of, unit_credit
+from .divergence import divergence_alarms
+from .experiment import experiments
+from .figures import figures
+from .location import location
+from .model import Model
+from .objective import Objective, Point, Unit, strengths_of
+from .preparation import Prepared
+from .report import Candidate, Finding, Gap, Parameter, Report
+from .rollout import rollout_errors
+from .scatter import Scatter
+from .screening import Screen
+from .selection import Selection
+from .shrinkage import Shrinkage, shrinkage
+from .verdict import conclude
+
+Array = NDArray[np.float64]
+
+
+def assemble(
+    system: System,
+    *,
+    prepared: Prepared,
+    selection: Selection,
+    scatter: Scatter,
+    findings: Sequence[SanityFinding],
+    generator: np.random.Generator,
+    begun: float,
+    alpha: float,
+) -> Report:
+    """Return the report.
+
+    Args:
+        system: The robot.
+        prepared: Split, noise, horizon, nominal fit.
+        selection: What the search found.
+        scatter: What was found of effects of chance.
+        findings: Of the sanity gate.
+        generator: Of the bootstrap.
+        begun: When the diagnosis began, by ``time.perf_counter``.
+        alpha: Level of the tests.
+    """
+    credit = credit_of(selection)
+    if credit:
+        selection = settled(selection, max(credit, key=credit.__getitem__), prepared.sets)
+    credit, best = credit_of(selection), selection.best
+    points = _points(selection)
+    found = _with_chance(
+        _lasting(prepared, selection, credit, points=points, generator=generator),
+        scatter,
+        system.robot,
+        generator,
+    )
+    measured, seen = found.measured, (*candidates(selection, found.confused, alpha),)
+    seen = (*seen, *scatter.candidates())
+    parameters = _parameters(system, prepared, selection)
+    where, remainder = _locations(prepared, selection, credit)
+    verdict, summary, more = conclude(
+        system,
+        prepared,
+        selection=selection,
+        measured=measured,
+        effects=found.effects,
+        candidates=seen,
+        confused=found.confused,
+        scattered=scatter.groups,
+        where=where,
+        alpha=alpha,
+    )
+    if verdict in {"none", "unknown", "not_testable"}:
+        # what little was tried is among the candidates
+        found = replace(found, effects=(), strengths={}, confused=())
+    alarms = [*prepared.alarms, *(str(f) for f in findings), *_absorbed(parameters)]
+    named = ["as described", "with fitted parameters", "with the effects"][: 2 + bool(best.units)]
+    alarms += divergence_alarms(
+        prepared.sets["test"], dict(zip(named, points.values(), strict=False))
+    )
+    return Report(
+        verdict=verdict,
+        summary=summary,
+        effects=found.effects,
+        confusion_set=found.confused,
+        where=where,
+        remainder=remainder,
+        gap=_gap(measured, prepared, rollout_errors(prepared, points)),
+        candidates=seen,
+        parameters=parameters,
+        alarms=(*alarms, *more),
+        next_experiment=experiments(
+            prepared, selection, found.confused, _not_excited(selection, seen), generator=generator
+        ),
+        audit=_audit(system, prepared, selection, begun=begun),
+        strengths=found.strengths,
+        figures=figures(prepared, selection, measured),
+    )
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What was found, and how far the gap shrinks with it."""
+
+    measured: Shrinkage
+    effects: tuple[Finding, ...]
+    strengths: Mapping[Effect, Mapping[str, float]]
+    confused: tuple[str, ...]
+
+
+def _points(selection: Selection) -> dict[str, Point]:
+    """Return the simulator at the prior's mean, with fitted parameters, and with effects."""
+    nominal = selection.nominal.fit.point
+    zero = Point(np.zeros_like(nominal.z))
+    return {"raw": zero, "refit": nominal, "with_effects": selection.best.fit.point}
+
+
+def _lasting(
+    prepared: Prepared,
+    selection: Selection,
+    credit: Mapping[str, float],
+    *,
+    points: Mapping[str, Point],
+    generator: np.random.Generator,
+) -> _Found:
+    """Return what the search found of effects that are the same in every run."""
+    robot = prepared.predictor.system.robot
+    measured = shrinkage(
+        prepared.sets["test"],
+        list(points.values()),
+        generator,
+        floor=_floor(selection, prepared.sets),
+        beside=prepared.sets["validation"],
+    )
+    confused = confusion_set(selection, max(credit, key=credit.__getitem__)) if credit else ()
+    effects = _effects(selection, credit, measured, robot)
+    return _Found(measured, effects, _by_target(selection.best.fit.point, robot), tuple(confused))
+
+
+def _with_chance(
+    found: _Found, scatter: Scatter, robot: Robot, generator: np.random.Generator
+) -> _Found:
+    """Return the same with the effects of chance, beside those that last or in their place."""
+    if scatter.beside:
+        effects = scatter.findings(
+            measured := scatter.measured(found.measured, generator),
+            robot,
+            others=found.measured.explained,
+        )
+        found = replace(
+            found,
+            measured=measured,
+            effects=(*found.effects, *effects),
+            strengths={**found.strengths, **scatter.strengths(robot)},
+        )
+    elif scatter.found:
+        measured = scatter.measured(found.measured, generator)
+        effects = scatter.findings(measured, robot)
+        found = _Found(measured, effects, scatter.strengths(robot), scatter.names)
+    if scatter.holds:
+        measured = scatter.with_holds(found.measured)
+        others = sum(effect.share_of_gap for effect in found.effects)
+        held = scatter.held_findings(measured, others)
+        found = _Found(
+            measured,
+            (*found.effects, *held),
+            {**found.strengths, SensorDropout(): dict(held[0].strengths)},
+            found.confused or tuple(f.name for f in held),
+        )
+    return found
+
+
+def _absorbed(parameters: Sequence[Parameter]) -> list[str]:
+    return [
+        f"{p.name} was fitted to {p.without_effects:.3g}, at the edge of its prior "
+        f"[{p.prior[0]:.3g}, {p.prior[1]:.3g}]: an effect is being absorbed by parameters"
+        for p in parameters
+        if p.at_bound
+    ]
+
+
+def _gap(measured: Shrinkage, prepared: Prepared, rollouts: Mapping[str, Any]) -> Gap:
+    return Gap(
+        horizon_steps=prepared.horizon,
+        raw=measured.raw,
+        refit=measured.refit,
+        with_effects=measured.effects,
+        floor=1.0,
+        explained_fraction=measured.explained,
+        ci95=measured.elsewhere,
+        by_parameters=(measured.raw - measured.refit) / max(measured.raw - 1.0, 1e-9),
+        rollout_rmse=rollouts,
+    )
+
+
+def _audit(
+    system: System, prepared: Prepared, selection: Selection, *, begun: float
+) -> dict[str, Any]:
+    return {
+        **{name: list(names) for name, names in prepared.names.items()},
+        "mode": prepared.mode.name,
+        "simulator_steps": prepared.predictor.steps,
+        "noise_floor_source": prepared.noise_source,
+        "noise": dict(zip(system.robot.channels, prepared.noise.tolist(), strict=True)),
+        "segments": {name: len(o.segments) for name, o in prepared.sets.items()},
+        "p_values": list(selection.p_values),
+        "seconds": time.perf_counter() - begun,
+    }
+
+
+def _floor(selection: Selection, sets: Mapping[str, Objective]) -> float:
+    """Return the mean squared innovation that a perfect simulator leaves, at most 1.
+
+    Known where effects were found: what the best model leaves of the runs that it was found on.
+    """
+    best = selection.best
+    if not best.units:
+        return 1.0
+    parts = (best.fit.innovations, sets["train"]), (best.validation, sets["validation"])
+    left = sum(float((one**2).sum()) for one, _ in parts)
+    size = sum(float((o.whitening.weights**2).sum()) * one.shape[1] for one, o in parts)
+    return min(left / size, 1.0)
+
+
+def _not_excited(selection: Selection, candidates: Sequence[Candidate]) -> list[Unit]:
+    """Return the units of effects that the data could have shown nowhere, at all targets first."""
+    excited = {c.name for c in candidates if c.status != "not_excited"}
+    units = dict.fromkeys(replace(u, onset=0.0) for u in selection.screens[0].units)
+    return sorted((u for u in units if u.name not in excited), key=lambda u: u.where != "all")
+
+
+def _by_target(point: Point, robot: Robot) -> dict[Effect, dict[str, float]]:
+    """Return strengths by effect and name of the target, zeros left out."""
+    return {
+        effect: {
+            name: float(s) for name, s in zip(effect.targets(robot), strength[0], strict=True) if s
+        }
+        for effect, strength in strengths_of([point], robot).items()
+    }
+
+
+def _effects(
+    selection: Selection, credit: Mapping[str, float], measured: Shrinkage, robot: Robot
+) -> tuple[Finding, ...]:
+    """Return the effects of the best model, units of one effect together."""
+    best = selection.best
+    size = len(best.fit.point.z)
+    errors = strength_errors(best.fit, best.dispersion(), size)
+    found = []
+    for name in dict.fromkeys(u.name for u in best.units):
+        units = [u for u in best.units if u.name == name]
+        strengths = [u.actual(best.fit.point.strengths[u]) for u in units]
+        mean = float(np.mean(strengths))
+        error = float(np.sqrt(np.sum([errors[u] ** 2 for u in units])) / len(units))
+        found.append(
+            Finding(
+                name=name,
+                where=units[0].where if len({u.where for u in units}) == 1 else "all",
+                strength=mean,
+                unit=unit_at(units[0].effect, robot, int(np.argmax(units[0].direction))),
+                ci95=(mean - 1.96 * error, mean + 1.96 * error),
+                p_value=selection.p_values[0],
+                share_of_gap=max(0.0, credit.get(name, 0.0) * measured.explained),
+                strengths={u.where: s for u, s in zip(units, strengths, strict=True)},
+            )
+        )
+    return tuple(sorted(found, key=lambda f: -f.share_of_gap))
+
+
+def _parameters(system: System, prepared: Prepared, selection: Selection) -> tuple[Parameter, ...]:
+    """Return the parameters before and after the effects."""
+    if system.prior is None:
+        return ()
+    objective = prepared.sets["train"]
+    alone, together = selection.nominal.fit, selection.best.fit
+    size = objective.size
+    covariance = together.covariance(selection.best.dispersion())[:size, :size]
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    edge = np.sqrt(3.0)
+    low = objective.theta(np.full(size, -edge))
+    high = objective.theta(np.full(size, edge))
+    first, last = objective.theta(alone.point.z), objective.theta(together.point.z)
+    spread = objective.theta(together.point.z + 1e-3) - objective.theta(together.point.z - 1e-3)
+    return tuple(
+        Parameter(
+            name=name,
+            prior=(float(low[i]), float(high[i])),
+            without_effects=float(first[i]),
+            with_effects=float(last[i]),
+            sd=float(deviations[i] * abs(spread[i]) / 2e-3),
+            at_bound=bool(abs(alone.point.z[i]) > 0.98 * edge),
+        )
+        for i, name in enumerate(system.prior.names)
+    )
+
+
+def _locations(
+    prepared: Prepared, selection: Selection, credit: Mapping[str, float]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return where the error sits before the effects, and after them."""
+    train, judged = prepared.sets["train"], prepared.sets["validation"]
+    found = unit_credit(selection, credit)
+
+    def where(model: Model, seen: Screen, gains: Mapping[Unit, float]) -> dict[str, Any]:
+        point = model.fit.point
+        return location((train, _raw(train, point)), (judged, _raw(judged, point)), seen, gains)
+
+    before = where(selection.nominal, selection.screens[0], found)
+    after = where(selection.best, selection.screens[-1], {})
+    return before, after
+
+
+def _raw(objective: Objective, point: Point) -> Array:
+    return objective.raw([point])[0]

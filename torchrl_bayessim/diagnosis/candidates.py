@@ -1,0 +1,96 @@
+"""What the data say about every effect at every place, found or not."""
+
+from __future__ import annotations
+
+__all__ = ["candidates", "strength_errors"]
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .objective import Unit
+from .refit import Fit
+from .report import Candidate
+from .selection import Selection
+
+_UNTESTED = 0.2  # of an effect's range that does nothing in these data
+
+
+def candidates(
+    selection: Selection, confused: Sequence[str], alpha: float
+) -> tuple[Candidate, ...]:
+    """Return what the data say about every unit."""
+    seen = selection.screens[0]
+    dispersion = max(1.0, float((selection.nominal.fit.innovations**2).mean()))
+    strongest, detectable = seen.best(1.0), seen.detectable(alpha)
+    fitted = {m.units[0]: m for m in selection.tried if len(m.units) == 1}
+    used = set(selection.best.units)
+    excess = max(seen.residual - seen.effective, 1e-9)
+    growth = dict(zip(seen.units, (seen.growth**2).tolist(), strict=True))
+    swallowed: dict[Unit, float] = {}
+    for unit, share in zip(seen.units, seen.swallowed.tolist(), strict=True):
+        swallowed[unit] = max(swallowed.get(unit, 0.0), share)
+    result = []
+    likely = sorted(strongest, key=lambda unit: (unit not in used, unit not in fitted))
+    forms = {str(unit): unit for unit in reversed(likely)}  # one law of each name and place
+    for unit, (ratio, strength) in strongest.items():
+        if forms[str(unit)] is not unit:
+            continue
+        model, ci, gain = fitted.get(unit), None, None
+        strength = unit.actual(strength)  # noqa: PLW2901
+        if model is not None:
+            strength = unit.actual(model.fit.point.strengths[unit])  # noqa: PLW2901 - knows better
+            error = strength_errors(model.fit, model.dispersion(), len(model.fit.point.z))[unit]
+            ci = (strength - 1.96 * error, strength + 1.96 * error)
+            before = float((selection.nominal.validation**2).sum())
+            gain = before - float((model.validation**2).sum())
+        least = detectable[unit]
+        result.append(
+            Candidate(
+                name=unit.name,
+                where=unit.where,
+                strength=strength,
+                ci95=ci,
+                likelihood_ratio=ratio,
+                p_value=float(min(1.0, len(detectable) * np.exp(-ratio / dispersion / 2))),
+                held_out_gain=gain,
+                explained_fraction=float(np.clip(ratio * growth[unit] / excess, 0.0, 1.0)),
+                explained_by_parameters=swallowed[unit],
+                minimal_detectable_strength=unit.actual(least) if np.isfinite(least) else None,
+                status=_status(
+                    unit,
+                    used,
+                    confused,
+                    ratio=ratio / dispersion,
+                    least=least,
+                    inside=swallowed[unit],
+                ),
+            )
+        )
+    return tuple(sorted(result, key=lambda c: -c.likelihood_ratio))
+
+
+def _status(
+    unit: Unit,
+    used: set[Unit],
+    confused: Sequence[str],
+    *,
+    ratio: float,
+    least: float,
+    inside: float,
+) -> Any:
+    if unit in used:
+        return "named"
+    if unit.name in confused or inside > 0.98:
+        return "confounded"
+    if not np.isfinite(least) or least > unit.high or unit.onset > _UNTESTED * unit.high:
+        return "not_excited"
+    return "rejected" if ratio > 12 else "ruled_out"
+
+
+def strength_errors(fit: Fit, dispersion: float, size: int) -> dict[Unit, float]:
+    """Return the standard error of each strength, beside ``size`` parameters."""
+    covariance = fit.covariance(dispersion)
+    deviations = np.sqrt(np.maximum(np.diag(covariance)[size:], 0.0))
+    return {u: float(d * (u.high - u.onset)) for u, d in zip(fit.units, deviations, strict=True)}

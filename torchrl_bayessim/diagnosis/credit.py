@@ -1,0 +1,65 @@
+"""Whose merit it is that a gap shrinks, where several effects were found."""
+
+from __future__ import annotations
+
+__all__ = ["credit_of", "shares", "unit_credit"]
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
+from math import factorial
+
+import numpy as np
+
+from .objective import Unit
+from .selection import Selection
+
+
+def credit_of(selection: Selection) -> dict[str, float]:
+    """Return each effect's share of the deviance that all of them remove, over all orders."""
+    names = list(dict.fromkeys(u.name for u in selection.best.units))
+    full = float(selection.best.deviances().sum())
+    none = float(selection.nominal.deviances().sum())
+    if not names or none <= full:
+        return dict.fromkeys(names, 0.0)
+    known = {frozenset(names): full, frozenset[str](): none}
+    for model in selection.tried:
+        inside = frozenset(u.name for u in model.units)
+        if inside and inside < frozenset(names) and set(model.units) <= set(selection.best.units):
+            known[inside] = min(known.get(inside, np.inf), float(model.deviances().sum()))
+
+    def value(some: frozenset[str]) -> float:
+        if some in known:
+            return (none - known[some]) / (none - full)
+        smaller = [known[other] for other in known if other <= some]
+        return (none - min(smaller)) / (none - full)
+
+    return shares(names, value)
+
+
+def unit_credit(selection: Selection, credit: Mapping[str, float]) -> dict[Unit, float]:
+    """Return the credit of each unit of the best model, equal for those of one effect."""
+    best = selection.best
+    counts = {name: sum(u.name == name for u in best.units) for name in credit}
+    return {u: max(credit.get(u.name, 0.0), 0.0) / counts[u.name] for u in best.units}
+
+
+def shares(names: Sequence[str], value: Callable[[frozenset[str]], float]) -> dict[str, float]:
+    """Return each member's credit, averaged over all orders of joining (Shapley 1953).
+
+    Example:
+        >>> credit = shares(["a", "b"], lambda s: {0: 0.0, 1: 0.3, 2: 1.0}[len(s)])
+        >>> credit
+        {'a': 0.5, 'b': 0.5}
+    """
+    count = len(names)
+    credit = {}
+    for name in names:
+        others = [n for n in names if n != name]
+        total = 0.0
+        for size in range(count):
+            weight = factorial(size) * factorial(count - size - 1) / factorial(count)
+            for some in combinations(others, size):
+                with_it = value(frozenset([*some, name]))
+                total += weight * (with_it - value(frozenset(some)))
+        credit[name] = total
+    return credit
