@@ -18,6 +18,7 @@ from __future__ import annotations
 __all__ = ["conclude"]
 
 from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -50,25 +51,22 @@ def conclude(
     where: Mapping[str, Any],
     alpha: float,
 ) -> tuple[Verdict, str, list[str]]:
-    """Return the verdict, the sentence, and further alarms."""
+    """Return the verdict, the sentence, and further alarms.
+
+    Args:
+        system: The robot.
+        prepared: Split, noise, horizon, nominal fit.
+        selection: What the search found.
+        measured: How far the gap shrinks.
+        effects: What was found, chance among it.
+        candidates: What the data say about every effect.
+        confused: Names that cannot be told from the cause, itself first.
+        scattered: Groups of the effects of chance that were found.
+        where: The error's place.
+        alpha: Level of the tests.
+    """
     alarms: list[str] = []
-    groups = {u.effect.group for u in selection.best.units if u.name in confused[:1]}
-    groups |= {u.effect.group for s in selection.screens[:1] for u in s.units if u.name in confused}
-    groups |= scattered
-    significant = selection.p_values[0] <= alpha or bool(scattered)
-    splits = [float((m**2).mean()) for m in
-              (selection.nominal.fit.innovations, selection.nominal.validation)]  # fmt: skip
-    visible = measured.excess_ci[0] > 0 and (
-        min(measured.refit, *splits) > _UNEXPLAINED
-        or (measured.refit > SHOWN and selection.p_values[0] < _CERTAIN)
-    )
-    # of a large gap, 2 % may be ten times the noise: proof that the law is another one
-    nearly_all = measured.explained >= _ALL and measured.effects <= _NOISE_AGAIN
-    left = measured.remainder_ci[0] > _NEGLIGIBLE and not nearly_all
-    validated = share_on_validation(selection)
-    perhaps_nothing = measured.explained_ci[0] <= 0 and validated < _PARTIAL and not scattered
-    unsaid = measured.explained < _PARTIAL or perhaps_nothing
-    elsewhere = unsaid and hardly_shown(measured) and validated >= enough(selection.p_values[0])
+    weighed = _Weighed.of(selection, measured, effects, scattered=scattered, alpha=alpha)
     verdict: Verdict
     if not _excited(system, prepared):
         verdict = "not_testable"
@@ -79,39 +77,90 @@ def conclude(
             f"the robot moves too fast for velocities to be told from positions at "
             f"{1 / system.control_dt:.3g} Hz: log velocities, or more rows a second"
         )
-    elif not effects and not visible:
-        verdict = "none"
     elif not effects:
-        verdict = "unknown"
-    elif measured.refit - 1.0 <= _NEGLIGIBLE and measured.excess_ci[0] <= 0:
-        # seen by the search, but too small to matter on the test runs
-        verdict = "none" if not significant else "named_partial"
-    elif unsaid:
-        sure = visible or selection.p_values[0] < _CERTAIN
-        verdict = "named_partial" if elsewhere else "unknown" if sure else "none"
-    elif len(groups) > 1 and len(confused) > 1:
-        verdict = "ambiguous"
-    elif measured.explained >= NAMED and not left:
-        verdict = "named"
+        verdict = "unknown" if weighed.visible else "none"
     else:
-        verdict = "named_partial"
+        groups = {u.effect.group for u in selection.best.units if u.name in confused[:1]}
+        first = selection.screens[:1]
+        groups |= {u.effect.group for s in first for u in s.units if u.name in confused}
+        verdict = weighed.named(ambiguous=len(groups | scattered) > 1 and len(confused) > 1)
     if len(prepared.names["train"]) == 1 and verdict == "named" and prepared.alarms:
         verdict = "named_partial"
-    return (
+    sentence = _sentence(
         verdict,
-        _sentence(
-            verdict,
-            system,
-            prepared,
-            measured=measured,
-            effects=effects,
-            candidates=candidates,
-            confused=confused,
-            validated=validated if elsewhere else None,
-            where=where,
-        ),
-        alarms,
+        system,
+        prepared,
+        measured=measured,
+        effects=effects,
+        candidates=candidates,
+        confused=confused,
+        validated=weighed.validated if weighed.elsewhere else None,
+        where=where,
     )
+    return verdict, sentence, alarms
+
+
+@dataclass(frozen=True)
+class _Weighed:
+    """What speaks for a gap, and for what was found.
+
+    Attributes:
+        measured: How far the gap shrinks on test runs.
+        significant: Whether the search, or chance, found something.
+        certain: Whether noise alone would never do this.
+        visible: Whether the gap can be seen without a cause.
+        validated: Share of the gap that is explained on validation runs.
+        unsaid: Whether test runs do not say that what was found explains it.
+        elsewhere: Whether validation runs do in their place.
+    """
+
+    measured: Shrinkage
+    significant: bool
+    certain: bool
+    visible: bool
+    validated: float
+    unsaid: bool
+    elsewhere: bool
+
+    @classmethod
+    def of(
+        cls,
+        selection: Selection,
+        measured: Shrinkage,
+        effects: Sequence[Finding],
+        *,
+        scattered: Set[str],
+        alpha: float,
+    ) -> _Weighed:
+        p_value = selection.p_values[0]
+        splits = [float((m**2).mean()) for m in
+                  (selection.nominal.fit.innovations, selection.nominal.validation)]  # fmt: skip
+        certain = p_value < _CERTAIN
+        visible = measured.excess_ci[0] > 0 and (
+            min(measured.refit, *splits) > _UNEXPLAINED or (measured.refit > SHOWN and certain)
+        )
+        validated = share_on_validation(selection) if effects else 0.0
+        perhaps_nothing = measured.explained_ci[0] <= 0 and validated < _PARTIAL and not scattered
+        unsaid = measured.explained < _PARTIAL or perhaps_nothing
+        elsewhere = unsaid and hardly_shown(measured) and validated >= enough(p_value)
+        significant = p_value <= alpha or bool(scattered)
+        return cls(measured, significant, certain, visible, validated, unsaid, elsewhere)
+
+    def named(self, *, ambiguous: bool) -> Verdict:
+        """Return the verdict on effects that were found."""
+        measured = self.measured
+        if measured.refit - 1.0 <= _NEGLIGIBLE and measured.excess_ci[0] <= 0:
+            # seen by the search, but too small to matter on the test runs
+            return "named_partial" if self.significant else "none"
+        if self.unsaid:
+            sure = self.visible or self.certain
+            return "named_partial" if self.elsewhere else "unknown" if sure else "none"
+        if ambiguous:
+            return "ambiguous"
+        # of a large gap, 2 % may be ten times the noise: proof that the law is another one
+        nearly_all = measured.explained >= _ALL and measured.effects <= _NOISE_AGAIN
+        left = measured.remainder_ci[0] > _NEGLIGIBLE and not nearly_all
+        return "named" if measured.explained >= NAMED and not left else "named_partial"
 
 
 def _excited(system: System, prepared: Prepared) -> bool:
