@@ -223,8 +223,14 @@ def test_units_and_signs(change, kind):
     [
         ((DEGREES, 1.0), "motion_scale", "in degrees?"),
         ((0.5 / np.pi, 1.0), "motion_scale", "in turns?"),
+        ((200 / np.pi, 1.0), "motion_scale", "in gradians?"),
+        ((1e3, 1.0), "motion_scale", "in thousandths?"),
+        ((2048 / np.pi, 1.0), "motion_scale", "too large by a factor of about"),  # an encoder's
+        ((0.02, 1.0), "motion_scale", "too small by a factor of about"),
         ((-1.0, 1.0), "motion_sign", "of opposite sign"),
         ((1.0, 1e-3), "action_scale", "in thousands?"),
+        ((1.0, 1e3), "action_scale", "in thousandths?"),  # which the model would clip
+        ((1.0, 50.0), "action_scale", "m1 and m2 too large by a factor of about"),
         ((1.0, 0.0), "no_actions", "were actions recorded?"),
     ],
 )
@@ -241,6 +247,40 @@ def test_one_log_in_other_units_is_named(velocities, factors, kind, said):
     (found,) = [f for f in findings if f.severity == "error"]
     assert (found.file, found.kind) == ("2.csv", kind)
     assert said in found.message
+
+
+@pytest.mark.parametrize(("factor", "kind"), [(DEGREES, "motion_scale"), (-1.0, "motion_sign")])
+def test_half_of_the_logs_may_be_odd(factor, kind):
+    system, records = simulated("arm")
+    for i in 1, 3, 5:
+        records = [*records]
+        records[i] = times(records[i], factor_q=factor, factor_v=factor)
+    found = [f for f in check(records, system) if f.severity == "error"]
+    assert {(f.file, f.kind) for f in found} == {(f"{i}.csv", kind) for i in (1, 3, 5)}
+
+
+@pytest.mark.parametrize(
+    ("factor", "kind"), [(-1.0, "motion_sign"), (1e3, "action_scale")]
+)  # another sign of the actions looks as one of the motion
+def test_units_may_change_within_a_log(factor, kind):
+    system, records = simulated("arm", steps=600)
+    changing = np.where(np.arange(600) < 350, 1.0, factor)[:, None]
+    changed = replace(records[2], ctrl=changing * records[2].ctrl)
+    findings = check([*records[:2], changed, *records[3:]], system)
+    (found,) = [f for f in findings if f.severity == "error"]
+    assert (found.file, found.kind, found.rows[1]) == ("2.csv", kind, 599)
+    assert found.rows[0] == pytest.approx(350, abs=10)
+    assert len(usable_logs([changed], system, findings)[0]) == found.rows[0]
+
+
+def test_a_slide_in_millimetres_lies_beyond_its_limits():
+    def millimetres(record):
+        return times(record, factor_q=np.array([1e3, 1.0]), factor_v=np.array([1e3, 1.0]))
+
+    findings, *_ = spoilt(millimetres, only=2, name="cartpole")
+    (found,) = [f for f in findings if f.severity == "error"]
+    assert (found.file, found.kind) == ("2.csv", "motion_scale")
+    assert "slider position and slider velocity in thousandths" in found.message
 
 
 @pytest.mark.parametrize("name", ["arm", "cartpole"])

@@ -8,10 +8,17 @@ that this log's motion takes, and its *misfit* is what that leaves,
 .. math:: m = \frac{\operatorname{median} |y - \hat y|}
    {\operatorname{median} |y - c| + \operatorname{median} |\tau|} .
 
-A log is named where its misfit is near 1 and just one other unit or sign brings it down to that of
-the others, so that no payload, friction or push is taken for a unit: what many units would mend is
-no matter of units. Actions that never change
-are named where the motion takes about as much force as actuators exert in the other logs.
+A log is named where its misfit is near 1 and another unit or sign, of its motion or of its actions,
+brings it down to that of the others (see `readings`), so that no payload, friction or push is taken
+for a unit: what both a unit and a sign would mend is no matter of either. So is a part of a log,
+before or after the row where the misfit changes most, of a second or more. The others are those
+whose motion takes about the force that their actuators exert, so half of the logs, or more, may be
+odd. Actions that never change are named where the motion takes about as much force as actuators
+exert in the other logs.
+
+Not to be told are: all logs in other units (`forces` says what can be said of it), factors below 5,
+which may be another gain or mass, units at joints that no actuator moves, and, where dynamics are
+linear, whether it is the motion or the actions.
 """
 
 from __future__ import annotations
@@ -22,7 +29,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,36 +38,38 @@ from .inverse_dynamics import (
     Dynamics,
     Terms,
     actuated_joints,
-    dynamics,
     fit_terms,
     moves,
     regressors,
 )
 from .kinematics import motions
-from .log import Log
+from .readings import FACTOR, readings, unclamped
 from .record import Record, plausible
 from .system import System
 
 Array = NDArray[np.float64]
 _CLEAR = 3.0  # times what other logs leave
 _MISFIT, _AGAINST = 0.5, 0.65  # of 1, where motion has nothing to do with actions, or is opposite
-_ANGLES = {np.pi / 180: "in degrees", 2 * np.pi: "in turns", -1.0: "of opposite sign"}
-_LENGTHS = {1e-3: "in thousandths", -1.0: "of opposite sign"}
-_ACTIONS = {1e-3: "in thousandths", 1e3: "in thousands", -1.0: "of opposite sign"}
+_KNOWN = 0.12  # misfit of others, beyond which they tell no factor but those of units
+_OTHER = 5.0  # times another gain or mass that a factor must be which is of no unit
 _FAR = 1e3  # m or rad, and times what is travelled, that logs may be apart
 
 
 class _Others(NamedTuple):
-    """What other logs say of a joint: coefficients, misfit, typical actuation, what is left."""
+    """What other logs say of a joint.
+
+    Coefficients, misfit, typical actuation, what is left, and the largest action of each actuator.
+    """
 
     added: Array
     misfit: float
     exerted: float
     left: float
+    reach: Array
 
 
 def check_units(logs: Sequence[Dynamics], system: System, half: int) -> Iterator[Finding]:
-    """Yield which logs are in other units than the rest, or hold no actions.
+    """Yield which logs, or first or last parts of them, are in other units, or hold no actions.
 
     Args:
         logs: With their forces, in windows of ``2 half + 1`` rows.
@@ -70,32 +78,61 @@ def check_units(logs: Sequence[Dynamics], system: System, half: int) -> Iterator
     """
     if len({one.record.name for one in logs}) < 2:
         return
-    model = system.task.model
     named: set[str] = set()
-    for joint, dof in actuated_joints(model):
+    for joint, dof in actuated_joints(system.task.model):
         fits = [fit_terms(one.terms(dof), half=half) for one in logs]
         for one in logs:
             known = [
-                (other.terms(dof), fit.added)
+                (other, fit.added)
                 for other, fit in zip(logs, fits, strict=True)
-                if fit is not None and other.record.name != one.record.name
+                if fit is not None
+                and 0.1 < fit.slope < 10  # or it is that one which is odd
+                and other.record.name != one.record.name
             ]
-            if not known or _few(one.terms(dof), half) or one.record.name in named:
+            if not known or len(one.log) < 20 * half or one.record.name in named:
                 continue
-            others = _others([terms for terms, _ in known], [added for _, added in known])
-            if not 0.1 < 1 + others.added[0] < 10:  # it is they that are odd
-                continue
-            kind, text = _unit(one, joint, system, others=others, half=half)
-            if kind:
-                named.add(one.record.name)
-                yield _whole(kind, one.record, text)
+            others = _others([other for other, _ in known], dof, [added for _, added in known])
+            for part in (one, *_odd_part(one, dof, others, half)):
+                kind, text = _unit(part, joint, system, others=others, half=half)
+                if kind:
+                    named.add(one.record.name)
+                    yield _part(kind, part, text)
+                    break
 
 
-def _others(logs: Sequence[Terms], added: Sequence[Array]) -> _Others:
+def _odd_part(one: Dynamics, dof: int, others: _Others, half: int) -> Iterator[Dynamics]:
+    """Yield the part, before or after the row where it changes most, beside which one fits."""
+    if not one.free.any():
+        return
+    needed, actuated, bias, _ = terms = tuple(force[:, dof] for force in one.forces)
+    left = np.abs(needed - actuated - bias - regressors(terms) @ others.added)
+    left = np.where(one.free, np.minimum(left, 4 * others.left + np.median(left)), np.nan)
+    level = np.nancumsum(left - np.nanmean(left))
+    row = int(np.argmax(np.abs(level))) + 1
+    parts = [_rows(one, rows) for rows in (slice(row), slice(row, None))]
+    if any(_few(part.terms(dof), half) for part in parts):
+        return
+    misfits = [_misfit(part.terms(dof), others.added) for part in parts]
+    if min(misfits) < 1.5 * others.misfit + 0.05:
+        yield parts[int(np.argmax(misfits))]
+
+
+def _rows(one: Dynamics, rows: slice) -> Dynamics:
+    columns = {name: getattr(one.log, name)[rows] for name in ("time", "qpos", "qvel", "ctrl")}
+    forces = tuple(force[rows] for force in one.forces)
+    return Dynamics(one.record, replace(one.log, **columns), forces, one.free[rows])
+
+
+def _others(logs: Sequence[Dynamics], dof: int, added: Sequence[Array]) -> _Others:
     common = np.median(added, axis=0)
-    parts = np.median([_parts(terms, common) for terms in logs], axis=0)
+    parts = np.median([_parts(log.terms(dof), common) for log in logs], axis=0)
     left, needed, exerted = (float(part) for part in parts)
-    return _Others(common, left / (needed + exerted), exerted, left)
+    reach = np.median([_reach(log) for log in logs], axis=0)
+    return _Others(common, left / (needed + exerted), exerted, left, reach)
+
+
+def _reach(one: Dynamics) -> Array:
+    return one.log.ctrl.abs().amax(0).numpy()
 
 
 def _parts(terms: Terms, added: Array) -> tuple[float, float, float]:
@@ -116,25 +153,51 @@ def _misfit(terms: Terms, added: Array) -> float:
     return left / (needed + exerted)
 
 
+def _own(
+    one: Dynamics, system: System, dof: int, *, others: _Others, half: int
+) -> tuple[tuple[float, float, float], float]:
+    """Return a log's medians (see `_parts`) and misfit.
+
+    Actions that the model would clip count as they are, if those of the others are within limits.
+    The misfit is 1 where most rows are at limits of joints: in its own units they may not be.
+    """
+    terms = one.terms(dof)
+    if _few(terms, half):
+        return (0.0, 0.0, 0.0), float(one.free.mean() < 0.5)
+    model = system.task.model
+    limit = 1.5 * np.abs(model.actuator_ctrlrange).max(1)
+    limit[model.actuator_ctrllimited == 0] = np.inf
+    if (_reach(one) > limit).any() and (others.reach <= limit).all():
+        terms = unclamped(one, system, half)(1.0).terms(dof)
+    own = _parts(terms, others.added)
+    return own, own[0] / (own[1] + own[2])
+
+
 def _unit(
     one: Dynamics, joint: int, system: System, *, others: _Others, half: int
 ) -> tuple[str, str]:
     """Return the kind and text of what makes a log fit the others, or nothing."""
     model = system.task.model
     dof, name = int(model.jnt_dofadr[joint]), joint_names(model)[joint]
-    own = _parts(one.terms(dof), others.added)
-    misfit = own[0] / (own[1] + own[2])
+    own, misfit = _own(one, system, dof, others=others, half=half)
     if misfit < max(_MISFIT, _CLEAR * others.misfit):
         return "", ""
+    enough = min(misfit / 2, 1.5 * others.misfit + 0.05)
     likely: dict[str, str] = {}
-    for kind, text, log in _readings(one.log, joint, system):
-        terms = dynamics(model, one.record, log, half).terms(dof)
-        if kind.endswith("_sign") and misfit < _AGAINST:
-            continue
-        enough = min(misfit / 2, 1.5 * others.misfit + 0.05)
-        if not _few(terms, half) and _misfit(terms, others.added) < enough:
+
+    def left(terms: Terms) -> float:
+        return np.inf if _few(terms, half) else _misfit(terms, others.added)
+
+    gain = 1 + float(others.added[0])
+    least = _OTHER * max(gain, 1 / gain) if others.misfit < _KNOWN else np.inf
+    for kind, text, terms in readings(one, joint, system, half=half, misfit=left, least=least):
+        if left(terms) < enough and (misfit >= _AGAINST or not kind.endswith("_sign")):
             likely.setdefault(text, kind)
-    if len(likely) == 1 or set(likely.values()) == {"motion_sign", "action_sign"}:
+    units = {text: kind for text, kind in likely.items() if FACTOR not in text}
+    likely = units or likely  # rather than any number
+    kinds = set(likely.values())
+    alike = {"motion_sign", "action_sign"}, {"motion_scale", "action_scale"}
+    if len(likely) == 1 or kinds in alike:
         text = f"{' or '.join(likely)}? Only so does {name} move as in the other logs"
         return next(iter(likely.values())), text
     still = np.ptp(one.log.ctrl.numpy(), axis=0).max(initial=0.0) == 0
@@ -143,26 +206,6 @@ def _unit(
         text = f"{names} never changed, but {name} moves as if pushed: were actions recorded?"
         return "no_actions", text
     return "", ""
-
-
-def _readings(log: Log, joint: int, system: System) -> Iterator[tuple[str, str, Log]]:
-    """Yield a log as it would be in other units: kind, text, log."""
-    model, columns = system.task.model, system.columns
-    kinds = model.jnt_type
-    name = joint_names(model)[joint]
-    motion = " and ".join((*columns.qpos[name], *columns.qvel.get(name, ())))
-    hinge = kinds[joint] == mujoco.mjtJoint.mjJNT_HINGE
-    for factor, unit in (_ANGLES if hinge else _LENGTHS).items():
-        for alike in (np.flatnonzero(kinds == kinds[joint]), np.array([joint])):
-            qpos, qvel = log.qpos.clone(), log.qvel.clone()
-            qpos[:, model.jnt_qposadr[alike]] *= factor
-            qvel[:, model.jnt_dofadr[alike]] *= factor
-            kind = "motion_sign" if factor < 0 else "motion_scale"
-            yield kind, f"{motion} {unit}", replace(log, qpos=qpos, qvel=qvel)
-    for factor, unit in _ACTIONS.items():
-        kind = "action_sign" if factor < 0 else "action_scale"
-        text = f"{' and '.join(columns.ctrl.values())} {unit}"
-        yield kind, text, replace(log, ctrl=factor * log.ctrl)
 
 
 def check_offsets(records: Sequence[Record], system: System) -> Iterator[Finding]:
@@ -178,6 +221,13 @@ def check_offsets(records: Sequence[Record], system: System) -> Iterator[Finding
             if len(away) > 1 and np.median(away) > far and (away > far / 2).all():
                 text = f"{name} is {np.median(away):.3g} from where it is in other logs"
                 yield _whole("offset", record, f"{text}: another zero?")
+
+
+def _part(kind: str, part: Dynamics, text: str) -> Finding:
+    """Return what is found in the rows of a log."""
+    ends = (float(part.log.time[row]) for row in (0, -1))
+    first, last = (int(np.nanargmin(np.abs(part.record.time - time))) for time in ends)
+    return replace(_whole(kind, part.record, text), rows=(first, last), parts=((first, last),))
 
 
 def _whole(kind: str, record: Record, text: str) -> Finding:
