@@ -12,6 +12,7 @@ from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.envs.tasks.catalogue import known_task
 from torchrl_bayessim.logs.columns import Columns
 from torchrl_bayessim.logs.finding import Finding
+from torchrl_bayessim.logs.inverse_dynamics import dynamics
 from torchrl_bayessim.logs.record import Record
 from torchrl_bayessim.logs.sanity import check, refuse_spoilt, usable_logs
 from torchrl_bayessim.logs.simulators import simulator_task
@@ -271,6 +272,52 @@ def test_units_may_change_within_a_log(factor, kind):
     assert (found.file, found.kind, found.rows[1]) == ("2.csv", kind, 599)
     assert found.rows[0] == pytest.approx(350, abs=10)
     assert len(usable_logs([changed], system, findings)[0]) == found.rows[0]
+
+
+FLAG = """
+<mujoco>
+  <option timestep="0.002"/>
+  <worldbody>
+    <body>
+      <joint name="hinge" axis="0 1 0" damping="0.2"/>
+      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass="1"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="m" joint="hinge"/></actuator>
+</mujoco>
+"""
+
+
+def flags(count=4, rows=300):
+    """Return logs of an arm that gravity turns one way, held about the level it points along."""
+    model, time, records = arm(FLAG).model, 0.01 * np.arange(rows), []
+    for i in range(count):
+        data, found = mujoco.MjData(model), []
+        for t in time:
+            waves = np.sin((2.0 + i) * t) + 0.5 * np.sin((5.0 + i) * t + i)
+            data.ctrl[:] = -1.5 - 3.0 * data.qpos + waves
+            found.append((data.qpos.copy(), data.qvel.copy(), data.ctrl.copy()))
+            mujoco.mj_step(model, data, 5)
+        qpos, qvel, ctrl = (np.array(column) for column in zip(*found, strict=True))
+        records.append(Record(name=f"{i}.csv", time=time, qpos=qpos, qvel=qvel, ctrl=ctrl))
+    return System(task=arm(FLAG)), records
+
+
+def test_signs_of_motion_and_actions_differ_where_gravity_turns_one_way():
+    system, records = flags()
+    assert not kinds(check(records, system))
+    findings = check([*records[:2], times(records[2], factor_u=-1), records[3]], system)
+    (found,) = [f for f in findings if f.severity == "error"]
+    assert (found.file, found.kind) == ("2.csv", "action_sign")
+    assert found.message.startswith("m of opposite sign? Only so does hinge move")
+
+
+def test_an_action_holds_until_the_next_row():
+    system, (record, *_) = flags()
+    log = usable_logs([record], system, [])[0]
+    needed, actuated, _, speed = dynamics(system.task.model, record, log, 5).terms(0)
+    left = needed - actuated + 0.2 * speed
+    assert left.std() < 0.01 * actuated.std()
 
 
 def test_a_slide_in_millimetres_lies_beyond_its_limits():

@@ -48,8 +48,8 @@ from .record import Record, plausible
 from .system import System
 
 Array = NDArray[np.float64]
-_CLEAR = 3.0  # times what other logs leave
 _MISFIT, _AGAINST = 0.5, 0.65  # of 1, where motion has nothing to do with actions, or is opposite
+_PUSHED = 0.3  # of what actuators exert in other logs
 _KNOWN = 0.12  # misfit of others, beyond which they tell no factor but those of units
 _OTHER = 5.0  # times another gain or mass that a factor must be which is of no unit
 _FAR = 1e3  # m or rad, and times what is travelled, that logs may be apart
@@ -180,7 +180,7 @@ def _unit(
     model = system.task.model
     dof, name = int(model.jnt_dofadr[joint]), joint_names(model)[joint]
     own, misfit = _own(one, system, dof, others=others, half=half)
-    if misfit < max(_MISFIT, _CLEAR * others.misfit):
+    if misfit < _MISFIT:
         return "", ""
     enough = min(misfit / 2, 1.5 * others.misfit + 0.05)
     likely: dict[str, str] = {}
@@ -201,7 +201,7 @@ def _unit(
         text = f"{' or '.join(likely)}? Only so does {name} move as in the other logs"
         return next(iter(likely.values())), text
     still = np.ptp(one.log.ctrl.numpy(), axis=0).max(initial=0.0) == 0
-    if still and own[0] > max(_CLEAR * others.left, 0.3 * others.exerted):
+    if still and own[0] > others.left + _PUSHED * others.exerted:
         names = " and ".join(system.columns.ctrl.values())
         text = f"{names} never changed, but {name} moves as if pushed: were actions recorded?"
         return "no_actions", text
