@@ -20,12 +20,13 @@ from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
 from .candidates import candidates, strength_errors
 from .confusion import confusion_set, settled
-from .credit import credit_of, unit_credit
-from .divergence import divergence_alarms
+from .credit import apart, credit_of, unit_credit
+from .divergence import divergence_alarms, diverges_throughout
+from .doubts import doubts
 from .experiment import experiments
 from .figures import figures
 from .location import location
-from .model import Model
+from .model import Model, gain, needed
 from .objective import Objective, Point, Unit, strengths_of
 from .preparation import Prepared
 from .report import Candidate, Finding, Gap, Parameter, Report
@@ -62,6 +63,7 @@ def assemble(
         begun: When the diagnosis began, by ``time.perf_counter``.
         alpha: Level of the tests.
     """
+    selection = apart(selection, prepared.sets)
     credit = credit_of(selection)
     if credit:
         selection = settled(selection, max(credit, key=credit.__getitem__), prepared.sets)
@@ -77,6 +79,7 @@ def assemble(
     seen = (*seen, *scatter.candidates())
     parameters = _parameters(system, prepared, selection)
     where, remainder = _locations(prepared, selection, credit)
+    rollouts = rollout_errors(prepared, points)
     verdict, summary, more = conclude(
         system,
         prepared,
@@ -87,11 +90,14 @@ def assemble(
         confused=found.confused,
         scattered=scatter.groups,
         where=where,
+        diverges=diverges_throughout(rollouts),
+        doubts=doubts(found.effects, _every_unit(selection, scatter), prepared),
         alpha=alpha,
     )
     if verdict in {"none", "unknown", "not_testable"}:
         # what little was tried is among the candidates
         found = replace(found, effects=(), strengths={}, confused=())
+        seen = tuple(replace(c, status="rejected") if c.status == "named" else c for c in seen)
     alarms = [*prepared.alarms, *(str(f) for f in findings), *_absorbed(parameters)]
     named = ["as described", "with fitted parameters", "with the effects"][: 2 + bool(best.units)]
     alarms += divergence_alarms(
@@ -104,7 +110,7 @@ def assemble(
         confusion_set=found.confused,
         where=where,
         remainder=remainder,
-        gap=_gap(measured, prepared, rollout_errors(prepared, points)),
+        gap=_gap(measured, prepared, rollouts),
         candidates=seen,
         parameters=parameters,
         alarms=(*alarms, *more),
@@ -125,6 +131,10 @@ class _Found:
     effects: tuple[Finding, ...]
     strengths: Mapping[Effect, Mapping[str, float]]
     confused: tuple[str, ...]
+
+
+def _every_unit(selection: Selection, scatter: Scatter) -> list[Unit]:
+    return [*selection.screens[0].units, *(chance.unit for chance in scatter.found)]
 
 
 def _points(selection: Selection) -> dict[str, Point]:
@@ -248,6 +258,15 @@ def _not_excited(selection: Selection, candidates: Sequence[Candidate]) -> list[
     return sorted((u for u in units if u.name not in excited), key=lambda u: u.where != "all")
 
 
+def _held_out(selection: Selection) -> float:
+    """Return how likely chance gains on validation what the best of all units gained there.
+
+    A gap that no small strength explains may be one that a large one does.
+    """
+    better = gain(selection.nominal, selection.best) - needed(selection.nominal, selection.best)
+    return float(min(1.0, len(selection.screens[0].units) * np.exp(-max(better, 0.0) / 2)))
+
+
 def _by_target(point: Point, robot: Robot) -> dict[Effect, dict[str, float]]:
     """Return strengths by effect and name of the target, zeros left out."""
     return {
@@ -278,7 +297,7 @@ def _effects(
                 strength=mean,
                 unit=unit_at(units[0].effect, robot, int(np.argmax(units[0].direction))),
                 ci95=(mean - 1.96 * error, mean + 1.96 * error),
-                p_value=selection.p_values[0],
+                p_value=min(selection.p_values[0], _held_out(selection)),
                 share_of_gap=max(0.0, credit.get(name, 0.0) * measured.explained),
                 strengths={u.where: s for u, s in zip(units, strengths, strict=True)},
             )

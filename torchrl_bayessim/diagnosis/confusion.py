@@ -125,10 +125,12 @@ def stand_in(selection: Selection, rival: Model) -> str:
 
 
 def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> Selection:
-    """Return the selection with that one of equals in front that explains the test runs best."""
+    """Return the selection with that one of equals in front that explains most.
+
+    Of training and validation: test runs choose nothing.
+    """
     equals = [selection.best, *rivals(selection, name)]
-    left = [float((one**2).sum()) for one in sets["test"]([model.fit.point for model in equals])]
-    first = equals[left.index(min(left))]
+    first = min(equals, key=lambda model: float(model.deviances().sum()))
     if first is selection.best:
         return selection
     others = tuple(m for m in (selection.best, *selection.alternatives[name]) if m is not first)

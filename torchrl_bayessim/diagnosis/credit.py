@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
-__all__ = ["credit_of", "shares", "unit_credit"]
+__all__ = ["apart", "credit_of", "shares", "unit_credit"]
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 from math import factorial
 
 import numpy as np
 
-from .objective import Unit
-from .selection import Selection
+from .objective import Objective, Unit
+from .selection import Selection, parts
+
+
+def apart(selection: Selection, sets: Mapping[str, Objective]) -> Selection:
+    """Return the selection with all fits without one of the effects among what was tried.
+
+    Effects that were added together may never have been fitted one by one.
+    """
+    best = selection.best
+    names = {unit.name for unit in best.units}
+    known = [set(model.units) for model in selection.tried]
+    missing = [{u for u in best.units if u.name != name} not in known for name in names]
+    if len(names) < 2 or not any(missing):
+        return selection
+    return replace(
+        selection,
+        tried=(*selection.tried, *parts(sets["train"], sets["validation"], best)),
+    )
 
 
 def credit_of(selection: Selection) -> dict[str, float]:
@@ -37,10 +55,21 @@ def credit_of(selection: Selection) -> dict[str, float]:
 
 
 def unit_credit(selection: Selection, credit: Mapping[str, float]) -> dict[Unit, float]:
-    """Return the credit of each unit of the best model, equal for those of one effect."""
-    best = selection.best
-    counts = {name: sum(u.name == name for u in best.units) for name in credit}
-    return {u: max(credit.get(u.name, 0.0), 0.0) / counts[u.name] for u in best.units}
+    """Return the credit of each unit of the best model.
+
+    Those of one effect share it by the squared length of what each changes.
+    """
+    fit = selection.best.fit
+    columns = fit.jacobian[:, len(fit.point.z) :]
+    sizes = {
+        unit: float((columns[:, i] ** 2).sum()) * (fit.point.strengths[unit] / unit.high) ** 2
+        for i, unit in enumerate(fit.units)
+    }
+    sums = {name: sum(s for u, s in sizes.items() if u.name == name) for name in credit}
+    return {
+        u: max(credit.get(u.name, 0.0), 0.0) * size / max(sums.get(u.name, 0.0), 1e-30)
+        for u, size in sizes.items()
+    }
 
 
 def shares(names: Sequence[str], value: Callable[[frozenset[str]], float]) -> dict[str, float]:

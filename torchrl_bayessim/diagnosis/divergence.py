@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-__all__ = ["divergence_alarms"]
+__all__ = ["HINT", "divergence_alarms", "diverges_throughout"]
 
 from collections.abc import Mapping
 
 import numpy as np
 
 from .objective import Objective, Point
+
+HINT = "check masses, stiffnesses and the time step"
 
 
 def divergence_alarms(objective: Objective, points: Mapping[str, Point]) -> list[str]:
@@ -25,6 +27,19 @@ def divergence_alarms(objective: Objective, points: Mapping[str, Point]) -> list
         if diverged:
             alarms.append(
                 f"the simulator {name} diverges on {diverged:.0%} of the stretches that the robot "
-                "lived through: check masses, stiffnesses and the time step"
+                f"lived through: {HINT}"
             )
     return alarms
+
+
+def diverges_throughout(rollouts: Mapping[str, Mapping[str, float]]) -> bool:
+    """Return whether the simulator without effects lives through no whole run.
+
+    Over a few steps even that is finite, and what then explains it is anything that holds it back.
+
+    Args:
+        rollouts: Open-loop error of each channel, infinite after a divergence, by name of the
+            point: ``raw`` and ``refit``.
+    """
+    alone = rollouts["raw"], rollouts["refit"]
+    return all(not np.isfinite(list(errors.values())).any() for errors in alone)

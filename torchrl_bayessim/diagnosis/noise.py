@@ -24,6 +24,7 @@ _AT_ONCE = 5.0  # the most that a round trusts: too large a noise hides how far 
 _SETTLED = 0.1  # logarithm of a factor that is not worth another round
 _STEPS, _FEWER = 8, 4  # control steps of a segment; where that makes few segments, half of them
 _BEYOND = 3.0  # times its spec, or its like, that a sensor is not noisier than
+_ROUGHLY = 2.0  # times what third differences say
 _LIKE = 3  # sensors of one kind
 
 
@@ -41,6 +42,7 @@ def measured_noise(
 ) -> tuple[Array, str]:
     """Return each channel's noise: the differences of innovations, checked by the sensor's spec."""
     system, noise = predictor.system, assumed_noise(predictor, logs)
+    rough = noise_from_differences(logs, [_coordinates(predictor, log) for log in logs])
     channels, tiny = system.robot.channels, 1e-6 * system.robot.channel_scale.numpy()
     given = np.array([system.noise.get(name, np.nan) for name in channels])
     pieces = _pieces(logs, history=history)
@@ -55,7 +57,7 @@ def measured_noise(
         pushed = objective(points) if points else np.zeros((0, *fit.innovations.shape))
         factor = innovation_noise(fit.innovations, pushed - fit.innovations, len(pieces.checked))
         noise = np.maximum(noise * np.clip(factor, 1 / _AT_ONCE, _AT_ONCE), tiny)
-        estimate, noise = noise, np.minimum(noise, _most(noise, given, system.robot))
+        estimate, noise = noise, np.minimum(noise, _most(noise, given, rough, system.robot))
         if np.abs(np.log(np.maximum(factor, 1e-9))).max() < _SETTLED:
             break
     apart = [
@@ -78,14 +80,17 @@ def _pieces(logs: Sequence[Log], *, history: int) -> Segments:
     return pieces
 
 
-def _most(noise: Array, given: Array, robot: Robot) -> Array:
+def _most(noise: Array, given: Array, rough: Array, robot: Robot) -> Array:
     """Return what each channel's noise cannot exceed, shape ``(C,)``.
 
     Where a missing effect never rests, all that its joint does looks like noise, a hundred times
     what its sensor has. A sensor is some times worse than its spec, if there is one, or than most
-    of its like, the same readings of the other hinges that motors move.
+    of its like, the same readings of the other hinges that motors move. Nor is it noisier than
+    third differences say, which hold the motion's as well, unless sensors are so coarse, or rest so
+    much, that most of them are zero.
     """
     most = np.where(given > 0, _BEYOND * given, np.inf)
+    most = np.minimum(most, np.where(rough > 0, _ROUGHLY * rough, np.inf))
     if robot.model is None:
         return most
     moved = {joint for joint in robot.joint_of_actuator if joint >= 0}

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from ..logs.system import System
+from .divergence import HINT
 from .preparation import Prepared
 from .report import Candidate, Finding, Verdict
 from .selection import Selection
@@ -34,6 +35,8 @@ _NEGLIGIBLE = 0.05  # of the noise floor: an excess that no one would chase
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
 _CERTAIN = 1e-15  # p-value of a gap that is too small to be seen at a glance
 _MOST = 0.5  # of the joints without measured velocity
+_WORSE = 1.2  # times the error as described, with parameters fitted to other runs
+_PLACE = 0.2  # of the error, to say that it sits there
 _NOISE_AGAIN = 2.0  # mean squared innovation: as much again as the noise
 _ALL, _PARTIAL = 0.98, 0.4
 
@@ -49,6 +52,8 @@ def conclude(
     confused: Sequence[str],
     scattered: Set[str],
     where: Mapping[str, Any],
+    diverges: bool,
+    doubts: Sequence[str],
     alpha: float,
 ) -> tuple[Verdict, str, list[str]]:
     """Return the verdict, the sentence, and further alarms.
@@ -63,20 +68,15 @@ def conclude(
         confused: Names that cannot be told from the cause, itself first.
         scattered: Groups of the effects of chance that were found.
         where: The error's place.
+        diverges: Whether the simulator lives through no whole run.
+        doubts: Why nothing should be named without reserve.
         alpha: Level of the tests.
     """
-    alarms: list[str] = []
     weighed = _Weighed.of(selection, measured, effects, scattered=scattered, alpha=alpha)
+    obstacle = _obstacle(system, prepared, diverges=diverges)
     verdict: Verdict
-    if not _excited(system, prepared):
+    if obstacle is not None:
         verdict = "not_testable"
-        alarms.append("commands and motion hardly vary: no effect can be told from another")
-    elif _too_fast(prepared):
-        verdict = "not_testable"
-        alarms.append(
-            f"the robot moves too fast for velocities to be told from positions at "
-            f"{1 / system.control_dt:.3g} Hz: log velocities, or more rows a second"
-        )
     elif not effects:
         verdict = "unknown" if weighed.visible else "none"
     else:
@@ -84,8 +84,10 @@ def conclude(
         first = selection.screens[:1]
         groups |= {u.effect.group for s in first for u in s.units if u.name in confused}
         verdict = weighed.named(ambiguous=len(groups | scattered) > 1 and len(confused) > 1)
-    if len(prepared.names["train"]) == 1 and verdict == "named" and prepared.alarms:
+    few = len(prepared.names["train"]) == 1 and prepared.alarms
+    if verdict == "named" and (few or doubts):
         verdict = "named_partial"
+    alarms = [obstacle[0]] if obstacle else [*doubts] if verdict.startswith("named") else []
     sentence = _sentence(
         verdict,
         system,
@@ -96,6 +98,7 @@ def conclude(
         confused=confused,
         validated=weighed.validated if weighed.elsewhere else None,
         where=where,
+        hint=obstacle[1] if obstacle else "",
     )
     return verdict, sentence, alarms
 
@@ -163,6 +166,21 @@ class _Weighed:
         return "named" if measured.explained >= NAMED and not left else "named_partial"
 
 
+def _obstacle(system: System, prepared: Prepared, *, diverges: bool) -> tuple[str, str] | None:
+    """Return why nothing can be said, and what to do about it, if so."""
+    if not _excited(system, prepared):
+        why = "commands and motion hardly vary: no effect can be told from another"
+        return why, "record motion that exceeds the noise"
+    if _too_fast(prepared):
+        rate = f"{1 / system.control_dt:.3g} Hz"
+        why = f"the robot moves too fast for velocities to be told from positions at {rate}"
+        return f"{why}: log velocities, or more rows a second", "sample faster"
+    if diverges:
+        why = "the simulator diverges on every whole test run, which the robot lived through"
+        return f"{why}: {HINT}", f"the simulator diverges, {HINT}"
+    return None
+
+
 def _excited(system: System, prepared: Prepared) -> bool:
     """Return whether the robot moved by more than its sensors' noise."""
     segments = prepared.sets["train"].segments
@@ -190,6 +208,7 @@ def _sentence(
     confused: Sequence[str],
     validated: float | None,
     where: Mapping[str, Any],
+    hint: str,
 ) -> str:
     gap = f"Gap: {measured.refit:.3g} times the noise floor on {prepared.horizon}-step prediction."
     ruled_out = _ruled_out(candidates)
@@ -198,17 +217,22 @@ def _sentence(
     if system.prior is not None and measured.raw > measured.refit:
         share = (measured.raw - measured.refit) / max(measured.raw - 1.0, 1e-9)
         parameters = f" Retuning parameters alone explains {_percent(share)}."
+    elif measured.refit > _WORSE * measured.raw:
+        parameters = (
+            f" Retuning parameters alone makes test runs worse: {measured.raw:.3g} times the floor "
+            "as described."
+        )
     if verdict == "none":
         return f"No gap above noise ({measured.refit:.2f} times the floor).{ruled_out}{untested}"
     if verdict == "not_testable":
-        hint = "sample faster" if _too_fast(prepared) else "record motion that exceeds the noise"
         return f"These data cannot say: {hint}.{untested}"
     rules = where["regimes"]
-    place = f" It sits at {rules[0]['rule']}." if rules else ""
+    place = f" It sits at {rules[0]['rule']}." if rules and _much(rules[0]) else ""
     if verdict == "unknown":
         best = max((c.explained_fraction for c in candidates), default=0.0)
         best = max(best, measured.explained)
-        found = f"no effect of the catalogue explains more than {_percent(best)}"
+        tried = len({c.name for c in candidates})
+        found = f"none of the {tried} effects that were tried explains more than {_percent(best)}"
         if best >= _PARTIAL:
             found = "what could explain it on some runs does not hold on others"
         text = f"{gap} It is real, but {found}."
@@ -230,6 +254,11 @@ def _sentence(
     if len(confused) > 1:
         text += f" Not separable from: {', '.join(confused[1:])}."
     return f"{text}{parameters}{untested}"
+
+
+def _much(rule: Mapping[str, Any]) -> bool:
+    """Return whether a place holds enough of the error to be where it sits."""
+    return bool(rule["share"] >= _PLACE)
 
 
 def _percent(share: float) -> str:

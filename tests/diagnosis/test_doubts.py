@@ -1,0 +1,107 @@
+"""Where the simulator or the data say little, what explains them is not to be named."""
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+from test_diagnose import ARM, BOUNDS, SOME, logs, system
+
+from torchrl_bayessim.diagnosis.credit import unit_credit
+from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.divergence import diverges_throughout
+from torchrl_bayessim.diagnosis.doubts import doubts
+from torchrl_bayessim.diagnosis.objective import Point, units_of
+from torchrl_bayessim.diagnosis.report import Finding
+from torchrl_bayessim.effects.catalogue import effect as catalogued
+from torchrl_bayessim.effects.robot import robot_of
+from torchrl_bayessim.envs.task import Task
+from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.logs.system import System
+from torchrl_bayessim.physics.mujoco import MujocoPhysics
+
+TWO = """<mujoco><worldbody>
+  <body><joint name="a" axis="0 1 0"/><geom size=".1" mass="1"/>
+    <body pos="0 0 -.3"><joint name="b" axis="0 1 0"/><geom size=".1" mass="1"/></body></body>
+</worldbody></mujoco>"""
+
+
+def friction(x, v):
+    return -0.15 * np.tanh(v / 0.01)
+
+
+def test_an_unstable_simulator_names_nothing():
+    unstable = ARM.replace('damping=".05"', 'damping=".05" stiffness="-100"')
+    task = Task(model=mujoco.MjModel.from_xml_string(unstable), frame_skip=5)
+    wrong = System(task=task, physics=MujocoPhysics(*BOUNDS), prior=BoxPrior(BOUNDS))
+    report = diagnose(wrong, None, logs(push=friction), effects=SOME)
+    assert report.verdict == "not_testable"
+    assert "the simulator diverges" in report.summary
+    assert any("every whole test run" in alarm for alarm in report.alarms)
+    assert not report.effects
+    assert not [c for c in report.candidates if c.status == "named"]
+
+
+def test_commands_that_never_change_name_nothing_without_reserve():
+    still = [replace(log, ctrl=0 * log.ctrl) for log in logs(act=lambda u, k: 0.0, push=friction)]
+    report = diagnose(system(), None, still, effects=SOME)
+    assert report.verdict != "named"
+    if report.effects:
+        assert any("no command ever changes" in alarm for alarm in report.alarms)
+
+
+@pytest.mark.parametrize(
+    ("raw", "refit", "throughout"),
+    [(np.inf, np.inf, True), (np.inf, 0.1, False), (0.2, 0.1, False)],
+)
+def test_a_simulator_diverges_if_no_parameters_hold_it(raw, refit, throughout):
+    rollouts = {"raw": {"q": raw}, "refit": {"q": refit}, "with_effects": {"q": 0.1}}
+    assert diverges_throughout(rollouts) is throughout
+
+
+def found(strength, error=0.1, name="action_gain", where="motor"):
+    ends = strength - error, strength + error
+    return Finding(name=name, where=where, strength=strength, unit="fraction", ci95=ends,
+                   p_value=1e-9, share_of_gap=0.9, strengths={where: strength})  # fmt: skip
+
+
+def recorded(changing=True):
+    ctrl = np.zeros((3, 4, 1))
+    ctrl[0] = float(changing)
+    return SimpleNamespace(sets={"train": SimpleNamespace(segments=SimpleNamespace(ctrl=ctrl))})
+
+
+@pytest.mark.parametrize(
+    ("effect", "doubt"),
+    [
+        (found(0.5), "action gain at motor was fitted to 0.5 fraction, the end"),
+        (found(-0.5), r"the end of what is looked for, \[-0.5, 0.5\]"),
+        (found(0.2, error=0.3), "may be nothing: its interval"),
+    ],
+)
+def test_strengths_that_say_little_are_doubted(effect, doubt):
+    units = units_of([catalogued("action_gain")], system().robot)
+    (text,) = doubts([effect], units, recorded())
+    assert re.search(doubt, text)
+
+
+def test_a_strength_within_its_range_is_not_doubted_and_neither_is_nothing():
+    units = units_of([catalogued("action_gain"), catalogued("coulomb_friction")], system().robot)
+    assert doubts([found(0.2)], units, recorded()) == []
+    assert doubts([found(0.05, 0.01, "coulomb_friction", "hinge")], units, recorded()) == []
+    assert doubts([], units, recorded(changing=False)) == []
+    assert "no command ever changes" in doubts([found(0.2)], units, recorded(changing=False))[0]
+
+
+def test_places_of_one_effect_share_its_credit_by_what_each_changes():
+    robot = robot_of(Task(model=mujoco.MjModel.from_xml_string(TWO), frame_skip=5))
+    units = [u for u in units_of([catalogued("coulomb_friction")], robot) if u.where != "all"]
+    jacobian = np.zeros((10, 2))
+    jacobian[:5, 0], jacobian[5:, 1] = 1.0, 2.0
+    strengths = {units[0]: units[0].high, units[1]: units[1].high}
+    fit = SimpleNamespace(jacobian=jacobian, point=Point(np.zeros(0), strengths), units=units)
+    selection = SimpleNamespace(best=SimpleNamespace(fit=fit))
+    credit = unit_credit(selection, {"coulomb_friction": 0.5})
+    assert [credit[unit] for unit in units] == pytest.approx([0.1, 0.4])

@@ -1,0 +1,58 @@
+"""Why an effect that explains the data should still not be named without reserve."""
+
+from __future__ import annotations
+
+__all__ = ["doubts"]
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .objective import Unit
+from .preparation import Prepared
+from .report import Finding
+
+_EDGE = 0.98  # of the largest strength that is looked for
+
+
+def doubts(effects: Sequence[Finding], units: Sequence[Unit], prepared: Prepared) -> list[str]:
+    """Return what speaks against the causes that were found, in words.
+
+    A strength at the end of what is looked for may stand for another cause, one whose interval
+    holds zero for none, and commands that never change excite little of what a robot can do.
+
+    Args:
+        effects: What was found.
+        units: All that was looked for.
+        prepared: The logs.
+    """
+    if not effects:
+        return []
+    ends = {(u.name, u.where): (u.actual(u.low), u.actual(u.high)) for u in units}
+    found = [text for effect in effects for text in _of_strength(effect, ends)]
+    commands = np.concatenate([o.segments.ctrl.reshape(-1, o.segments.ctrl.shape[-1])
+                               for o in prepared.sets.values()])  # fmt: skip
+    if commands.shape[1] and not np.ptp(commands, axis=0).any():
+        found.append(
+            "no command ever changes: causes that would show under others cannot be told apart"
+        )
+    return found
+
+
+def _of_strength(effect: Finding, ends: dict[tuple[str, str], tuple[float, float]]) -> list[str]:
+    name, unit = effect.name.replace("_", " "), effect.unit
+    texts = []
+    for place, strength in effect.strengths.items():
+        low, high = ends.get((effect.name, place), (-np.inf, np.inf))
+        if not (_EDGE * low if low < 0 else -np.inf) < strength < _EDGE * high:
+            texts.append(
+                f"{name} at {place} was fitted to {strength:.3g} {unit}, the end of what is looked "
+                f"for, [{low:.3g}, {high:.3g}]: there is more of it, or it stands for another cause"
+            )
+    low, high = effect.ci95
+    if low <= 0 <= high:
+        texts.append(
+            f"{name} at {effect.where} may be nothing: its interval, [{low:.2g}, {high:.2g}] "
+            f"{unit}, holds zero"
+        )
+    return texts
