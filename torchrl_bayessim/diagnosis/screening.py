@@ -29,6 +29,7 @@ from .refit import Fit
 
 Array = NDArray[np.float64]
 LEVELS = (0.05, 0.4)  # of an effect's range
+_WILD = 500.0  # standard deviations
 _POWER = 0.84  # of the normal distribution at 0.8, to state what would have been seen
 
 
@@ -40,6 +41,7 @@ class Screen:
         units: The unit of each signature, length ``G``.
         strengths: Its strength, shape ``(G,)``.
         norms: ``‖g‖``: how many standard deviations the unit would move the data, ``(G,)``.
+        sizes: The same, also of what moves them too far to be compared.
         scores: ``gᵀr̃ / ‖g‖``, shape ``(G,)``.
         correlation: Cosines between signatures, shape ``(G, G)``.
         swallowed: Share of each signature that parameters would explain, shape ``(G,)``.
@@ -53,6 +55,7 @@ class Screen:
     units: tuple[Unit, ...]
     strengths: Array
     norms: Array
+    sizes: Array
     scores: Array
     correlation: Array
     swallowed: Array
@@ -96,7 +99,7 @@ class Screen:
         between levels by power laws, ``inf`` where even the highest level is not seen.
         """
         threshold = np.sqrt(2 * np.log(max(len(set(self.units)), 2) / alpha)) + _POWER
-        norms = self.norms * self.growth
+        norms = self.sizes * self.growth
         result: dict[Unit, float] = {}
         for unit in dict.fromkeys(self.units):
             rows = [i for i, u in enumerate(self.units) if u == unit and self.strengths[i] > 0]
@@ -146,6 +149,7 @@ class Screen:
             units=self.units + tuple(coarse.units[i] for i in rows),
             strengths=np.r_[self.strengths, coarse.strengths[rows]],
             norms=np.r_[self.norms, coarse.norms[rows]],
+            sizes=np.r_[self.sizes, coarse.sizes[rows]],
             scores=np.r_[self.scores, coarse.scores[rows]],
             correlation=correlation,
             swallowed=np.r_[self.swallowed, coarse.swallowed[rows]],
@@ -165,7 +169,7 @@ def screen(objective: Objective, fit: Fit, units: Sequence[Unit]) -> Screen:
     rows = [(unit, level * unit.high) for unit in units for level in LEVELS]
     rows += [(unit, LEVELS[-1] * unit.low) for unit in units if unit.low < 0]
     strengths = fit.point.strengths
-    changes = []
+    changes, wild = [], []
     chunk = max(1, 40_000_000 // max(fit.innovations.size, 1))
     for begin in range(0, len(rows), chunk):
         points = [
@@ -174,14 +178,19 @@ def screen(objective: Objective, fit: Fit, units: Sequence[Unit]) -> Screen:
         ]
         for innovations in objective(points):
             change = (innovations - fit.innovations).astype(np.float32)
-            if not np.isfinite(change).all() or (np.abs(innovations).max(-1) > 500).any():
-                change = np.zeros_like(change)  # a diverged simulation explains nothing
-            changes.append(change)
+            # what is so far off, or diverged, explains nothing: but it would have been seen
+            wild.append(float(np.linalg.norm(change)) if _is_wild(innovations) else 0.0)
+            changes.append(np.zeros_like(change) if wild[-1] else change)
     # little of an effect does the opposite of as little of its opposite
     small = [i for i, (unit, level) in enumerate(rows) if unit.low < 0 < level < unit.high / 10]
     rows += [(rows[i][0], LEVELS[0] * rows[i][0].low) for i in small]
     changes += [changes[i] * np.float32(rows[i][0].low / rows[i][0].high) for i in small]
-    return _compared(rows, changes, fit, objective.size)
+    wild += [wild[i] for i in small]
+    return _compared(rows, changes, fit, objective.size, wild=np.array(wild))
+
+
+def _is_wild(innovations: Array) -> bool:
+    return bool((np.abs(innovations) > _WILD).any())
 
 
 def _compared(
@@ -189,8 +198,10 @@ def _compared(
     changes: Sequence[NDArray[np.float32]],
     fit: Fit,
     size: int,
+    *,
+    wild: Array,
 ) -> Screen:
-    """Return the screen of what simulations changed."""
+    """Return the screen of what simulations changed, ``wild`` by the size of those left out."""
     basis = _basis(fit, size)
     left = np.r_[fit.innovations.ravel(), -fit.point.z[:size]]
     left = left - basis @ (basis.T @ left)
@@ -207,6 +218,7 @@ def _compared(
         units=tuple(unit for unit, _ in rows),
         strengths=np.array([level for _, level in rows]),
         norms=norms,
+        sizes=norms + wild,
         scores=directions @ left,
         correlation=directions @ directions.T,
         swallowed=np.where(seen, 1 - (norms / np.where(seen, before, 1.0)) ** 2, 0.0),

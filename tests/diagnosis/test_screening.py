@@ -1,0 +1,33 @@
+"""What moves the data too far to be compared would have been seen."""
+
+import numpy as np
+import torch
+from test_diagnose import logs, run, system
+
+from torchrl_bayessim.diagnosis.diagnose import diagnose
+
+
+class Quiet:
+    """Randomness of the commands, and a thousandth of the sensors' noise."""
+
+    def __init__(self, seed):
+        self._rng = np.random.default_rng(seed)
+
+    def uniform(self, low, high):
+        return self._rng.uniform(low, high)
+
+    def normal(self, scale=1.0, size=None):
+        return self._rng.normal(scale=scale, size=size) * (1.0 if size is None else 1e-3)
+
+
+def test_an_effect_that_is_far_too_strong_is_not_called_invisible():
+    data = logs()
+    for i, log in enumerate(data):
+        state, u = run(Quiet(i), len(log))
+        log.qpos[:], log.qvel[:] = torch.from_numpy(state).split(1, dim=1)
+        log.ctrl[:] = torch.from_numpy(u[:, None])
+    names = ("parallel_spring", "coulomb_friction", "action_gain")
+    report = diagnose(system(), None, data, effects=names)
+    assert not [c.name for c in report.candidates if c.status == "not_excited"]
+    spring = next(c for c in report.candidates if c.name == "parallel_spring")
+    assert 0 < spring.minimal_detectable_strength < 0.05
