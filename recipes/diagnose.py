@@ -24,16 +24,13 @@ from tqdm import tqdm
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.page import page
 from torchrl_bayessim.errors import message
-from torchrl_bayessim.kinds import check_choice
+from torchrl_bayessim.logs.checked import checked_logs
 from torchrl_bayessim.logs.log import Log
-from torchrl_bayessim.logs.read import read_records
-from torchrl_bayessim.logs.record import Record
-from torchrl_bayessim.logs.sanity import Finding, check, refuse_spoilt, usable_logs
+from torchrl_bayessim.logs.sanity import Finding
 from torchrl_bayessim.logs.system import System
 from torchrl_bayessim.whole_file import write_texts
 
 STAGES = 6  # of a search that ends after one round
-SHORTEST = 10  # control steps that a log must have where no horizon is given
 LONGEST = 10_000
 
 
@@ -78,31 +75,21 @@ def read(settings: Diagnosis) -> tuple[System, list[Log], list[Finding]]:
     for name in ("system", "data"):
         if not getattr(settings, name):
             raise ValueError(message(f"{name}=PATH", "none"))
-    check_choice("spoilt", settings.spoilt, ("refuse", "leave_out"))
     if settings.horizon < 0:
         raise ValueError(message("a horizon of 1 or more, or 0 to choose one", settings.horizon))
     if settings.horizon > LONGEST:
         raise ValueError(message(f"a horizon of at most {LONGEST} steps", settings.horizon))
     system = System.load(settings.system)
-    records = kept(read_records(settings.data, system), settings.leave_out)
-    findings = check(records, system, horizon=settings.horizon or SHORTEST)
-    if settings.spoilt == "refuse":
-        refuse_spoilt(findings)
+    logs, findings = checked_logs(
+        settings.data,
+        system,
+        leave_out=settings.leave_out.split(",") if settings.leave_out else (),
+        horizon=settings.horizon or None,
+        spoilt=settings.spoilt,
+    )
     for finding in findings:
         print(finding)
-    return system, usable_logs(records, system, findings), findings
-
-
-def kept(records: list[Record], leave_out: str) -> list[Record]:
-    """Return the records whose names contain none of the words."""
-    names = [record.name for record in records]
-    for word in leave_out.split(",") if leave_out else ():
-        records = [record for record in records if word.strip() not in record.name]
-        if not any(word.strip() in name for name in names):
-            raise ValueError(message("a part of a log's name to leave out", word, available=names))
-    if not records:
-        raise ValueError(message("logs beside those left out", "none", available=names))
-    return records
+    return system, logs, findings
 
 
 def chosen(effects: str) -> list[str] | None:

@@ -27,6 +27,7 @@ __all__ = [
     "SummaryStatistics",
     "SurrogateRobot",
     "System",
+    "checked_logs",
     "diagnose",
     "fit",
     "read_logs",
@@ -45,6 +46,7 @@ from .inference.posterior import MixtureDensityPosterior
 from .inference.priors import BoxPrior, GaussianPrior
 from .inference.refinement import PosteriorRefinement
 from .inference.sequential import sequential
+from .logs.checked import checked_logs
 from .logs.read import read_logs
 from .logs.system import System
 from .loop import SimToRealLoop

@@ -54,6 +54,23 @@ ENTRIES = {
         },
         {"source": "source of logs", "system": "object"},
     ),
+    "checked_logs": Entry(
+        package.checked_logs,
+        lambda: {
+            "source": recorded(40),
+            "system": system(),
+            "leave_out": (),
+            "horizon": None,
+            "spoilt": "leave_out",
+        },
+        {
+            "source": "source of logs",
+            "system": "object",
+            "leave_out": "names",
+            "horizon": "count or none",
+            "spoilt": "name",
+        },
+    ),
     "diagnose": Entry(
         package.diagnose,
         lambda: {

@@ -108,8 +108,9 @@ def system():
 
 
 def recorded(count):
-    q = 0.1 * torch.sin(0.03 * torch.arange(count, dtype=torch.float64))[:, None]
-    return TensorDict({"qpos": q, "qvel": q.clone(), "action": q.clone()}, [count])
+    phase = 0.2 * torch.arange(count, dtype=torch.float64)[:, None]
+    q, v = 0.1 * phase.sin(), 0.1 * 0.2 / system().control_dt * phase.cos()
+    return TensorDict({"qpos": q, "qvel": v, "action": q.clone()}, [count])
 
 
 def logs():

@@ -57,9 +57,10 @@ def diagnose(
         simulator: A name such as ``Hopper-v5``, a `Task`, or a `System`.
         prior: Over entries of the model, by their names, such as ``body_mass[torso]``; ``None``
             where a system has its own, or nothing is uncertain.
-        logs: What the real robot did.
+        logs: What the real robot did. They are taken as they are: `checked_logs` gives them,
+            malformed ones refused.
         effects: Names from the catalogue, or effects of your own; default the system's, or all.
-        findings: Of the sanity gate, to be repeated in the report.
+        findings: Of `checked_logs`, to be repeated in the report.
         mode: What is predicted and compared: ``segments`` from measured states, the default;
             ``trajectories`` from their first row on, where states cannot be set or hidden ones live
             long, the default where a joint that matters was not logged; ``summaries``,
