@@ -38,6 +38,7 @@ from .shrinkage import Shrinkage, shrinkage
 from .verdict import conclude
 
 Array = NDArray[np.float64]
+_WORTH = 0.01  # of the gap on test runs, of chance beside another cause
 
 
 def assemble(
@@ -171,17 +172,15 @@ def _with_chance(
 ) -> _Found:
     """Return the same with the effects of chance, beside those that last or in their place."""
     if scatter.beside:
-        effects = scatter.findings(
-            measured := scatter.measured(found.measured, generator),
-            robot,
-            others=found.measured.explained,
-        )
-        found = replace(
-            found,
-            measured=measured,
-            effects=(*found.effects, *effects),
-            strengths={**found.strengths, **scatter.strengths(robot)},
-        )
+        measured = scatter.measured(found.measured, generator)
+        if measured.explained - found.measured.explained > _WORTH:
+            others = found.measured.explained
+            found = replace(
+                found,
+                measured=measured,
+                effects=(*found.effects, *scatter.findings(measured, robot, others=others)),
+                strengths={**found.strengths, **scatter.strengths(robot)},
+            )
     elif scatter.found:
         measured = scatter.measured(found.measured, generator)
         effects = scatter.findings(measured, robot)

@@ -42,16 +42,17 @@ def checked_logs(
         ImportError: The format needs a package that is not installed.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_bayessim.envs.tasks.catalogue import known_task
-        >>> system = System(task=known_task("InvertedPendulum-v5"))
-        >>> angles = torch.linspace(0, 6, 80).double()[:, None].expand(80, 2)
-        >>> state = {"qpos": angles.sin(), "qvel": 6 / 79 / 0.04 * angles.cos()}
-        >>> data = TensorDict({**state, "action": angles[:, :1].sin()}, batch_size=[80])
-        >>> logs, findings = checked_logs(data, system)
-        >>> len(logs), "single_trajectory" in [finding.kind for finding in findings]
-        (1, True)
+        >>> from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+        >>> env = BatchedMujocoEnv("InvertedPendulum-v5", 3, seed=0)
+        >>> seen = env.rollout(20, policy=lambda td: td.set("action", env.action_spec.zero()))
+        >>> qpos, qvel = seen["observation"].chunk(2, -1)
+        >>> columns = {"qpos": qpos, "qvel": qvel, "action": seen["action"]}
+        >>> logs, findings = checked_logs(
+        ...     TensorDict(columns, batch_size=seen.batch_size), System(task=env.task)
+        ... )
+        >>> len(logs), [finding.kind for finding in findings]
+        (3, ['constant_action'])
     """
     check_choice("spoilt", spoilt, ("refuse", "leave_out"))
     check_kind("parts of logs' names to leave out", leave_out, list, tuple)
