@@ -351,7 +351,7 @@ def test_two_logs_tell_which_of_them_is_odd():
     ("change", "kind"),
     [
         (lambda r: times(r, factor_u=1e-3), "action_scale"),
-        (lambda r: times(r, factor_u=1e3), "action_range"),
+        (lambda r: times(r, factor_u=10), "action_range"),
         (lambda r: times(r, factor_v=1.4), "velocity_scale"),
         (lambda r: replace(r, qvel=np.roll(r.qvel, 4, axis=0)), "velocity_lag"),
         (lambda r: replace(r, ctrl=np.ones_like(r.ctrl)), "constant_action"),
@@ -361,6 +361,20 @@ def test_two_logs_tell_which_of_them_is_odd():
 def test_what_to_know(change, kind):
     findings, *_ = spoilt(change)
     assert kind in kinds(findings, "warning")
+
+
+def test_actions_that_no_controller_sends_are_refused():
+    findings, *_ = spoilt(lambda r: times(r, factor_u=1e3))
+    assert "action_range" in kinds(findings, "error")
+
+
+def test_what_is_short_for_another_reason_is_told_last():
+    findings = [
+        Finding(kind=kind, file="a", rows=(0, 9), message=kind, severity="error")
+        for kind in ("short", "time", "degrees")
+    ]
+    with pytest.raises(ValueError, match=r"degrees .*\| .*time .*\| .*short"):
+        refuse_spoilt(findings)
 
 
 def edited(record, rows, **columns):

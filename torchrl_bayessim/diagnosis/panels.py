@@ -25,7 +25,7 @@ from .report import Candidate, Finding, Report
 
 _STATUS = {
     "named": "named",
-    "confounded": "cannot be told apart",
+    "confounded": "cannot be told from the cause, or from parameters",
     "rejected": "explains less",
     "ruled_out": "ruled out",
     "not_excited": "not tested by these data",
@@ -54,7 +54,8 @@ def size(report: Report) -> Markup:
     low, high = gap.ci95
     told = (
         f"Mean squared innovation over {gap.horizon_steps} control steps on test runs, 1 for a "
-        "perfect simulator; whiskers are 95 % intervals over trajectories."
+        "perfect simulator; whiskers are 95 % intervals over trajectories, or over segments of "
+        "fewer than four."
     )
     if report.effects:
         told += (

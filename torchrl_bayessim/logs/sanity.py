@@ -29,6 +29,7 @@ from .units import check_offsets
 # errors that happen to a robot whose logs are as they should be: an impact within a control step
 # is a jump, and who swings freely has no actions. What they name is left out
 _HONEST = {"push", "position_jump", "velocity_spike", "no_actions"}
+_NO_COMMAND = 30.0  # times the range to which the model clips
 _MALFORMED = {"missing", "action_scale", "effort", "no_motion"}  # warnings of which that is not so
 
 
@@ -91,7 +92,9 @@ def refuse_spoilt(findings: Sequence[Finding]) -> None:
         or (finding.severity == "error" and finding.kind not in _HONEST)
     ]
     texts = []
-    for kind, alike in groupby(sorted(spoilt, key=lambda one: one.kind), lambda one: one.kind):
+    # what is too short may be so because of the others
+    spoilt.sort(key=lambda one: (one.kind == "short", one.kind))
+    for kind, alike in groupby(spoilt, lambda one: one.kind):
         first, *rest = alike
         files = list(dict.fromkeys(one.file for one in rest if one.file != first.file))
         more = f"; {len(files) - 4} more files" if len(files) > 4 else ""
@@ -132,8 +135,8 @@ def _whole(kind: str, record: Record, text: str, *, severity: str = "warning") -
     return Finding(kind=kind, file=record.name, rows=rows, message=text, severity=severity)
 
 
-def _general(kind: str, text: str) -> Finding:
-    return Finding(kind=kind, file="", rows=(0, 0), message=text)
+def _general(kind: str, text: str, *, severity: str = "warning") -> Finding:
+    return Finding(kind=kind, file="", rows=(0, 0), message=text, severity=severity)
 
 
 def _missing(record: Record, system: System) -> Iterator[Finding]:
@@ -191,4 +194,8 @@ def _actions(records: Sequence[Record], system: System) -> Iterator[Finding]:
         largest = max((np.abs(v).max() for v in values), default=0.0)
         if model.actuator_ctrllimited[i] and largest > 1.5 * max(-low, high):
             text = f"the action {name} reaches {largest:.3g}, and the model clips it to {high:.3g}"
-            yield _general("action_range", text)
+            # no controller asks for as much; of a part that is odd, other checks know more
+            wrong = np.median(np.abs(np.concatenate(values))) > _NO_COMMAND * max(-low, high)
+            hint = ": in other units?" if wrong else ""
+            severity = "error" if wrong else "warning"
+            yield _general("action_range", text + hint, severity=severity)
