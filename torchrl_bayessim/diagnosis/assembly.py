@@ -38,7 +38,7 @@ from .shrinkage import Shrinkage, shrinkage
 from .verdict import conclude
 
 Array = NDArray[np.float64]
-_WORTH = 0.01  # of the gap on test runs, of chance beside another cause
+_WORTH = 0.01  # of the gap on test runs, to name chance beside another cause
 
 
 def assemble(
@@ -187,14 +187,15 @@ def _with_chance(
         found = _Found(measured, effects, scatter.strengths(robot), scatter.names)
     if scatter.holds:
         measured = scatter.with_holds(found.measured)
-        others = sum(effect.share_of_gap for effect in found.effects)
-        held = scatter.held_findings(measured, others)
-        found = _Found(
-            measured,
-            (*found.effects, *held),
-            {**found.strengths, SensorDropout(): dict(held[0].strengths)},
-            found.confused or tuple(f.name for f in held),
-        )
+        if measured.explained - found.measured.explained > _WORTH:
+            others = sum(effect.share_of_gap for effect in found.effects)
+            held = scatter.held_findings(measured, others)
+            found = _Found(
+                measured,
+                (*found.effects, *held),
+                {**found.strengths, SensorDropout(): dict(held[0].strengths)},
+                found.confused or tuple(f.name for f in held),
+            )
     return found
 
 
