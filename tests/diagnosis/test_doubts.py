@@ -67,8 +67,8 @@ def found(strength, error=0.1, name="action_gain", where="motor"):
                    p_value=1e-9, share_of_gap=0.9, strengths={where: strength})  # fmt: skip
 
 
-def recorded(changing=True):
-    ctrl = np.zeros((3, 4, 1))
+def recorded(changing=True, actuators=1):
+    ctrl = np.zeros((3, 4, actuators))
     ctrl[0] = float(changing)
     return SimpleNamespace(sets={"train": SimpleNamespace(segments=SimpleNamespace(ctrl=ctrl))})
 
@@ -92,6 +92,7 @@ def test_a_strength_within_its_range_is_not_doubted_and_neither_is_nothing():
     assert doubts([found(0.2)], units, recorded()) == []
     assert doubts([found(0.05, 0.01, "coulomb_friction", "hinge")], units, recorded()) == []
     assert doubts([], units, recorded(changing=False)) == []
+    assert doubts([found(0.2)], units, recorded(actuators=0)) == []
     assert "no command ever changes" in doubts([found(0.2)], units, recorded(changing=False))[0]
 
 

@@ -30,9 +30,8 @@ def doubts(effects: Sequence[Finding], units: Sequence[Unit], prepared: Prepared
         return []
     ends = {(u.name, u.where): (u.actual(u.low), u.actual(u.high)) for u in units}
     found = [text for effect in effects for text in _of_strength(effect, ends)]
-    commands = np.concatenate([o.segments.ctrl.reshape(-1, o.segments.ctrl.shape[-1])
-                               for o in prepared.sets.values()])  # fmt: skip
-    if commands.shape[1] and not np.ptp(commands, axis=0).any():
+    commands = np.concatenate([o.segments.ctrl for o in prepared.sets.values()])
+    if commands.shape[2] and not np.ptp(commands, axis=(0, 1)).any():
         found.append(
             "no command ever changes: causes that would show under others cannot be told apart"
         )
