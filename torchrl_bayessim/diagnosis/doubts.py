@@ -30,8 +30,9 @@ def doubts(effects: Sequence[Finding], units: Sequence[Unit], prepared: Prepared
         return []
     ends = {(u.name, u.where): (u.actual(u.low), u.actual(u.high)) for u in units}
     found = [text for effect in effects for text in _of_strength(effect, ends)]
-    commands = np.concatenate([o.segments.ctrl for o in prepared.sets.values()])
-    if commands.shape[2] and not np.ptp(commands, axis=(0, 1)).any():
+    commands = [o.segments.ctrl for o in prepared.sets.values()]
+    least, most = (np.array([f(one, axis=(0, 1)) for one in commands]) for f in (np.min, np.max))
+    if least.size and (least.min(0) == most.max(0)).all():
         found.append(
             "no command ever changes: causes that would show under others cannot be told apart"
         )
