@@ -118,6 +118,22 @@ def test_a_tensordict_is_cut_where_an_episode_ends(tmp_path, pendulum):
     torch.testing.assert_close(saved[2].ctrl, logs[2].ctrl)
 
 
+def test_what_a_batch_cuts_off_an_episode_is_left_out(pendulum):
+    done = torch.zeros(2, 40, 1, dtype=torch.bool)
+    done[0, 33] = True
+    data = TensorDict(
+        {
+            "t": 0.01 * torch.arange(40.0).expand(2, 40),
+            "q": torch.randn(2, 40, 1),
+            "qd": torch.randn(2, 40, 1, requires_grad=True),
+            "tau": torch.randn(2, 40, 1),
+            "next": {"done": done},
+        },
+        batch_size=[2, 40],
+    )
+    assert [len(log) for log in read_logs(data, pendulum)] == [34, 40]
+
+
 def test_arrays_may_be_named_as_in_mujoco_and_need_no_time(box):
     pose = torch.tensor([0.0, 0, 1, 1, 0, 0, 0]).expand(7, 7)
     data = TensorDict({"state": {"qpos": pose, "qvel": torch.zeros(7, 6)}}, batch_size=[7])

@@ -208,6 +208,8 @@ DEGREES = 180 / np.pi
     [
         (lambda r: times(r, factor_q=DEGREES), "velocity_scale"),
         (lambda r: times(r, factor_v=DEGREES), "velocity_scale"),
+        (lambda r: times(r, factor_v=100.0), "velocity_scale"),
+        (lambda r: times(r, factor_q=1e7), "velocity_scale"),
         (lambda r: times(r, factor_v=-1), "velocity_sign"),
         (lambda r: times(r, factor_u=-1), "action_sign"),
         (lambda r: replace(r, time=1e3 * r.time), "time_unit"),

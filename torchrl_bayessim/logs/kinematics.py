@@ -25,6 +25,7 @@ from .system import System
 
 Array = NDArray[np.float64]
 _CLEAR = 30.0  # times the noise that a motion must be for what it says to count
+_WRONG = 4.0  # times as fast: no sensor's error, but another unit, whatever it is
 _RATIOS = {  # change of position by integrated velocity: what that means
     57.3: "positions are in degrees, velocities in radians",
     1 / 57.3: "velocities are in degrees, positions in radians",
@@ -138,7 +139,8 @@ def _agreement(motion: Motion, velocity: Array, time: Array) -> Iterator[Found]:
         if correlation > 0.9 and not 0.85 < ratio < 1.18:
             meaning = [text for r, text in _RATIOS.items() if abs(np.log(ratio / r)) < 0.15]
             text = meaning[0] if meaning else f"changes {ratio:.3g} times as fast as its velocity"
-            yield "velocity_scale", everywhere, text, "error" if meaning else "warning"
+            wrong = meaning or not 1 / _WRONG < ratio < _WRONG
+            yield "velocity_scale", everywhere, text, "error" if wrong else "warning"
             return
         if correlation > 0.9:
             yield from _lag(change, travelled, span, steps)

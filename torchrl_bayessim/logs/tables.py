@@ -34,6 +34,7 @@ from .system import System
 Array = NDArray[np.float64]
 _BATCH = 50_000  # rows that are held as text
 _LONGEST = 1_000_000  # characters of a line
+_STUMP = 10  # rows of what is left of an episode beside longer ones, too few for anything
 _MOST = 100_000_000  # rows: a day at 1 kHz
 
 
@@ -205,7 +206,8 @@ def _require_spaces(folder: Path) -> None:
 def tensordict_tables(data: TensorDictBase | Path, system: System) -> list[Table]:
     """Return the trajectories of a tensordict of batch size ``(*, T)``, cut where it is ``done``.
 
-    Entries under ``next`` are the next row's, and left out.
+    Entries under ``next`` are the next row's, and left out. So are episodes of 10 rows or fewer
+    beside longer ones of the same batch entry: what its size has cut off.
 
     Raises:
         ValueError: There is no batch dimension, the folder holds no tensordict or pickles, or the
@@ -223,23 +225,31 @@ def tensordict_tables(data: TensorDictBase | Path, system: System) -> list[Table
     rows = data.exclude("next").reshape(-1, data.shape[-1])
     ends = torch.zeros(rows.shape) if done is None else done.reshape(*rows.shape, -1).any(-1)
     tables = []
-    for i, row in enumerate(rows.unbind(0)):
-        cuts = [0, *(ends[i].nonzero()[:, 0] + 1).tolist(), rows.shape[1]]
-        for begin, end in pairwise(cuts):
-            if begin < end:
-                part = row[begin:end]
-                arrays = {
-                    ".".join((key,) if isinstance(key, str) else key): _array(value)
-                    for key, value in part.items(include_nested=True, leaves_only=True)
-                    if isinstance(value, torch.Tensor) and not value.is_complex()
-                }
-                label = f"{name}[{len(tables)}]"
-                tables.append(_table(label, arrays, system))
+    for row, ended in zip(rows.unbind(0), ends.unbind(0), strict=True):
+        for begin, end in _episodes(ended):
+            part = row[begin:end]
+            arrays = {
+                ".".join((key,) if isinstance(key, str) else key): _array(value)
+                for key, value in part.items(include_nested=True, leaves_only=True)
+                if isinstance(value, torch.Tensor) and not value.is_complex()
+            }
+            label = f"{name}[{len(tables)}]"
+            tables.append(_table(label, arrays, system))
     return tables
 
 
+def _episodes(ends: torch.Tensor) -> list[tuple[int, int]]:
+    """Return where episodes begin and end, but for stumps that a batch has cut off others."""
+    cuts = [0, *(ends.nonzero()[:, 0] + 1).tolist(), len(ends)]
+    parts = [(begin, end) for begin, end in pairwise(cuts) if begin < end]
+    if max(end - begin for begin, end in parts) <= _STUMP:
+        return parts
+    return [(begin, end) for begin, end in parts if end - begin > _STUMP]
+
+
 def _array(value: torch.Tensor) -> NDArray[Any]:
-    return value.numpy() if value.dtype == torch.bool else value.double().numpy()
+    plain = value.detach().cpu().resolve_neg()
+    return plain.numpy() if plain.dtype == torch.bool else plain.double().numpy()
 
 
 def _leaves(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
