@@ -1,5 +1,7 @@
 """Small robots whose cause is known; the generator steps MuJoCo itself."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -184,3 +186,16 @@ def test_logs_shorter_than_a_segment_are_refused():
 def test_unknown_effects_are_refused():
     with pytest.raises(KeyError, match="coulomb_friction"):
         diagnose(system(), None, logs(count=3, steps=40), effects=["coulomb_fricton"])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda log: replace(log, qpos=log.qpos * torch.nan), "NaN or infinity in qpos of run0"),
+        (lambda log: replace(log, ctrl=log.ctrl / 0.0), "NaN or infinity in ctrl of run0"),
+        (lambda log: replace(log, time=log.time.flip(0)), "whose time increases, got run0"),
+    ],
+)
+def test_logs_made_by_hand_are_finite_and_in_order(spoil, said):
+    with pytest.raises(ValueError, match=said):
+        diagnose(system(), None, [spoil(log) for log in logs(count=2, steps=30)])

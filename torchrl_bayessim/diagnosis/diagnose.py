@@ -71,8 +71,8 @@ def diagnose(
 
     Raises:
         TypeError: The simulator, the prior, a log or an effect is of another kind.
-        ValueError: There are no logs, none is long enough, an effect is asked for twice, or there
-            is no such mode.
+        ValueError: There are no logs, none is long enough, one is not finite or not in order, an
+            effect is asked for twice, or there is no such mode.
         KeyError: An effect is not in the catalogue.
     """
     begun = time.perf_counter()
@@ -82,7 +82,7 @@ def diagnose(
         check_count("horizon", horizon)
     check_kind("a sequence of logs", logs, list, tuple)
     for log in logs:
-        check_kind("a Log, as read_logs gives", log, Log)
+        _check_log(log)
     check_kind("a sequence of findings", findings, list, tuple)
     system = _system(simulator, prior)
     chosen = _effects(system, effects, logs)
@@ -128,6 +128,18 @@ def diagnose(
             begun=begun,
             alpha=_ALPHA,
         )
+
+
+def _check_log(log: Log) -> None:
+    check_kind("a Log, as read_logs gives", log, Log)
+    for name in ("time", "qpos", "qvel", "ctrl"):
+        if not bool(getattr(log, name).isfinite().all()):
+            hint = "read_logs, which leaves such rows out"
+            got = f"NaN or infinity in {name} of {log.name}"
+            raise ValueError(message("logs of finite numbers", got, hint=hint))
+    if not bool((log.time.diff() > 0).all()):
+        got = f"{log.name}, where it does not"
+        raise ValueError(message("logs whose time increases", got))
 
 
 def _asks_for_holds(units: Sequence[Unit]) -> bool:
