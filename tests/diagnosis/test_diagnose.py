@@ -193,7 +193,7 @@ def test_unknown_effects_are_refused():
     [
         (lambda log: replace(log, qpos=log.qpos * torch.nan), "NaN or infinity in qpos of run0"),
         (lambda log: replace(log, ctrl=log.ctrl / 0.0), "NaN or infinity in ctrl of run0"),
-        (lambda log: replace(log, time=log.time.flip(0)), "whose time increases, got run0"),
+        (lambda log: replace(log, time=log.time.flip(0)), "whose time increases, got 'run0"),
     ],
 )
 def test_logs_made_by_hand_are_finite_and_in_order(spoil, said):
