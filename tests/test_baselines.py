@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.logs.read import read_logs
 from torchrl_bayessim.logs.system import System
 
@@ -163,6 +164,17 @@ def test_a_named_effect_is_simulated_as_its_report_has_it(tmp_path, plain):
     assert strength == 0.1
     lost = {"name": "packet_drop", "where": "motor", "strengths": {"motor": 0.1}}
     assert _named(system, {"effects": [lost]}, logs) == {}
+
+
+def test_two_forms_of_an_effect_are_simulated_at_their_own_places():
+    from withheld.robots import ROBOTS, nominal_model
+    from withheld.shrinkage import _named
+
+    system = System(task=Task(model=nominal_model(ROBOTS["cart_pole"]), frame_skip=8))
+    found = {"name": "payload", "where": "all", "strengths": {"cart": 0.2, "pole": 0.1}}
+    report = {"effects": [found], "options": {"payload": {"at_end": True}}}
+    forms = {unit.where: unit.effect.at_end for unit in _named(system, report, [range(100)])}
+    assert forms == {"cart": False, "pole": True}
 
 
 def test_one_who_knows_all_strengths_names_the_cause(tmp_path, rubbing):

@@ -108,17 +108,17 @@ def _named(system: System, report: Mapping[str, Any], logs: Sequence[Log]) -> di
     """Return the strengths that a report names, at single targets; none of chance.
 
     Of an effect's forms that with the options that a report has, such as a frequency; else the
-    first, in the length of the runs that the report is on.
+    first, in the length of the runs that the report is on, and of places that it does not have the
+    one that has them: two forms of an effect may be named together.
     """
     seconds, options = max(len(log) for log in logs) * system.control_dt, report.get("options", {})
     lasting = [found for found in report["effects"] if not effect(found["name"]).random]
     names = dict.fromkeys(found["name"] for found in lasting)
-    kinds = [
-        effect(name, **options[name]) if name in options else effect(name).forms(seconds)[0]
-        for name in names
-    ]
-    units = units_of(kinds, system.robot)
-    by_place = {(unit.name, unit.where): unit for unit in units}
+    kinds = [effect(name, **options[name]) for name in names if name in options]
+    kinds += [form for name in names for form in effect(name).forms(seconds)]
+    by_place: dict[tuple[str, str], Unit] = {}
+    for unit in (unit for kind in kinds for unit in units_of([kind], system.robot)):
+        by_place.setdefault((unit.name, unit.where), unit)
     return {
         by_place[found["name"], where]: strength
         for found in lasting
