@@ -1,5 +1,6 @@
 """The gate lets clean logs pass, of whatever robot, and names what is spoilt."""
 
+import copy
 from dataclasses import replace
 from functools import cache
 
@@ -341,6 +342,32 @@ def test_a_log_far_from_the_others_is_named(name):
     assert found
     assert {(f.file, f.severity) for f in found} == {("2.csv", "error")}
     assert "is 1e+06 from where it is in other logs" in found[0].message
+
+
+def swinging(seed, *, rows=250):
+    """Return a log of a light pole that strikes the ends of its range, at every few steps."""
+    task = known_task("InvertedPendulum-v5")
+    model, rng = copy.copy(task.model), np.random.default_rng(seed)
+    model.body_mass[:] *= 0.6
+    waves = [(rng.normal(), rng.uniform(0.2, 2.5)) for _ in range(4)]
+    times = task.dt * np.arange(rows)
+    ctrl = 3 * np.clip(sum(a * np.sin(2 * np.pi * f * times) for a, f in waves), -1, 1)
+    data, states = mujoco.MjData(model), []
+    for u in ctrl:
+        states.append(np.r_[data.qpos, data.qvel])
+        data.ctrl[0] = u
+        mujoco.mj_step(model, data, task.frame_skip)
+    noise = rng.normal(size=(rows, 4)) * [1e-3, 1e-3, 0.01, 0.01]
+    qpos, qvel = np.split(np.array(states) + noise, 2, 1)
+    name = f"{seed}.csv"
+    return Record(name=name, time=times, qpos=qpos, qvel=qvel, ctrl=ctrl[:, None])
+
+
+def test_velocities_that_jump_at_a_limit_are_the_positions_own():
+    system = System(task=known_task("InvertedPendulum-v5"))
+    for seed in range(20):
+        findings = check([swinging(seed)], system)
+        assert "velocity_mismatch" not in kinds(findings, "error"), seed
 
 
 def test_two_logs_tell_which_of_them_is_odd():

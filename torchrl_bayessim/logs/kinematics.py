@@ -25,6 +25,7 @@ from .system import System
 
 Array = NDArray[np.float64]
 _CLEAR = 30.0  # times the noise that a motion must be for what it says to count
+_LIKE = 0.7  # correlation with a velocity that jumps within a step, as at a joint's limit
 _WRONG = 4.0  # times as fast: no sensor's error, but another unit, whatever it is
 _RATIOS = {  # change of position by integrated velocity: what that means
     57.3: "positions are in degrees, velocities in radians",
@@ -168,7 +169,7 @@ def _mismatch(
         if rows.sum() < 10 or min(moved[rows].std(), integrated[rows].std()) == 0:
             continue
         ratio = moved[rows].std() / integrated[rows].std()
-        if _likeness(moved, integrated, rows) > 0.9 and 1 / 3 < ratio < 3:
+        if _likeness(moved, integrated, rows) > _LIKE and 1 / 3 < ratio < 3:
             return None
     return "does not move as its velocity says: are columns swapped?"
 
