@@ -227,6 +227,13 @@ def bombs():
     sections = {
         "hfield": '<asset><hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>',
         "texture": '<asset><texture name="t" builtin="flat" width="9000" height="90000"/></asset>',
+        "hfields": "<asset>"
+        + "".join(
+            f'<hfield name="h{i}" nrow="10000" ncol="9000" size="1 1 1 1"/>' for i in range(4)
+        )
+        + "</asset>",
+        "readings": '<sensor><user dim="100000000"/></sensor>',
+        "activations": '<actuator><general joint="hinge" actdim="100000000"/></actuator>',
         "memory": '<size memory="1000G"/>',
         "user data": '<size nuserdata="2000000000"/>',
         "keys": '<size nkey="50000"/>',

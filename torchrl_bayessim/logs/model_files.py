@@ -46,8 +46,10 @@ def _elements(folder: Path, path: Path, *, within: tuple[Path, ...], known: dict
     roots = _included(folder, path)
     dirs = _dirs(roots)
     largest = 1  # of the models that are parts of this one
+    values = 0.0  # of pictures and height fields
     for element in (element for root in roots.values() for element in root.iter()):
-        _check_amount(element, path.name)
+        values += _check_amount(element, path.name)
+        _limit(values, _MOST_VALUES, "a number of values", path.name)
         for file in _named(folder, element, dirs):
             if element.tag == "model":
                 if file in within:
@@ -138,18 +140,28 @@ def inside(folder: Path, path: Path, shown: str) -> Path:
     return resolved
 
 
-def _check_amount(element: Element, file: str) -> None:
-    """Raise a ValueError if an element asks for more than any model needs, or holds no number."""
+def _check_amount(element: Element, file: str) -> float:
+    """Return how many values a picture or a height field holds.
+
+    Raises:
+        ValueError: The element asks for more than any model needs, or holds no number.
+    """
     for key, value in element.attrib.items():
         if "nan" in value.lower().split() and key != "name":
             raise ValueError(message(f"numbers in {file}", f'{key}="{value}"'))
+    values = 0.0
     for pair in ("nrow", "ncol"), ("width", "height"):
-        _limit(prod(_numbers(element.get(key, "1")) for key in pair), _MOST_VALUES, pair[0], file)
+        own = prod(_numbers(element.get(key, "1")) for key in pair)
+        _limit(own, _MOST_VALUES, pair[0], file)
+        values += own if pair[0] in element.attrib else 0.0
+    for key in ("dim", "actdim"):
+        _limit(_numbers(element.get(key, "1")), _MOST_SIZE, key, file)
     for key, value in element.attrib.items() if element.tag == "size" else ():
         unit = _UNITS.get(value.strip()[-1:].upper(), 0) if key == "memory" else 0
         amount = _numbers(value.strip()[:-1] if unit else value) * 2**unit
         most = {"memory": _MOST_MEMORY, "nkey": _MOST_KEYS}.get(key, _MOST_SIZE)
         _limit(amount, most, key, file)
+    return values
 
 
 def _check_picture(path: Path) -> None:
