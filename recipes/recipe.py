@@ -211,7 +211,7 @@ def resumed(settings: S, given: list[str]) -> S:
     path = Path(folder, "settings.json")
     if not path.exists():
         raise ValueError(message("the folder of a run to resume", folder, hint="the out= of a run"))
-    earlier = json.loads(path.read_text()) | {"resume": folder, "out": folder}
+    earlier = _earlier(path, type(settings)) | {"resume": folder, "out": folder}
     for key in given:
         value = getattr(settings, key)
         if key in FREE:
@@ -219,6 +219,22 @@ def resumed(settings: S, given: list[str]) -> S:
         elif value != earlier[key]:
             raise ValueError(message(f"{key}={earlier[key]}, as in the run to resume", value))
     return dataclasses.replace(settings, **earlier)
+
+
+def _earlier(path: Path, settings_type: type[Settings]) -> dict[str, Any]:
+    """Return the settings that a run has noted, all of them and of their types."""
+    fields = {field.name for field in dataclasses.fields(settings_type)}
+    try:
+        found = json.loads(path.read_text())
+        if not isinstance(found, dict) or found.keys() != fields:
+            raise ValueError
+        typed: Any = OmegaConf.to_object(
+            OmegaConf.merge(OmegaConf.structured(settings_type), OmegaConf.create(found))
+        )
+    except (ValueError, OmegaConfBaseException):
+        expected, hint = f"the settings of a {settings_type.__name__} run", "begin the run anew"
+        raise ValueError(message(expected, f"another {path}", hint=hint)) from None
+    return dataclasses.asdict(typed)
 
 
 def provenance(settings: Settings, *, seconds: float) -> dict[str, Any]:

@@ -291,6 +291,22 @@ def test_debug_shows_the_traceback_however_it_is_spelt(debug, refused, monkeypat
         recipe.main(sim2real_ppo.Sim2Real, sim2real_ppo.job)
 
 
+@pytest.mark.parametrize("spoil", ["list", "empty", "infinite", "text", "cut"])
+def test_settings_that_no_run_has_noted_are_not_resumed(spoil, finished, refused, tmp_path):
+    text = (finished[0] / "settings.json").read_text()
+    folder = tmp_path / "spoilt"
+    folder.mkdir()
+    spoilt = {
+        "list": "[]",
+        "empty": "{}",
+        "infinite": json.dumps(json.loads(text) | {"seed": "1e400"}),
+        "text": json.dumps(json.loads(text) | {"rounds": "many"}),
+        "cut": text[: len(text) // 2],
+    }
+    (folder / "settings.json").write_text(spoilt[spoil])
+    assert "expected the settings of a Sim2Real run" in refused(f"resume={folder}")
+
+
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
