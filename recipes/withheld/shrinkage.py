@@ -117,7 +117,7 @@ def _named(system: System, report: Mapping[str, Any], logs: Sequence[Log]) -> di
     kinds = [effect(name, **options[name]) for name in names if name in options]
     kinds += [form for name in names for form in effect(name).forms(seconds)]
     by_place: dict[tuple[str, str], Unit] = {}
-    for unit in (unit for kind in kinds for unit in units_of([kind], system.robot)):
+    for unit in units_of(kinds, system.robot):
         by_place.setdefault((unit.name, unit.where), unit)
     return {
         by_place[found["name"], where]: strength

@@ -76,8 +76,7 @@ def assemble(
         system.robot,
         generator,
     )
-    measured, seen = found.measured, (*candidates(selection, found.confused, alpha),)
-    seen = (*seen, *scatter.candidates())
+    seen = (*candidates(selection, found.confused, alpha), *scatter.candidates())
     parameters = _parameters(system, prepared, selection)
     where, remainder = _locations(prepared, selection, credit)
     rollouts = rollout_errors(prepared, points)
@@ -85,7 +84,7 @@ def assemble(
         system,
         prepared,
         selection=selection,
-        measured=measured,
+        measured=found.measured,
         effects=found.effects,
         candidates=seen,
         confused=found.confused,
@@ -111,7 +110,7 @@ def assemble(
         confusion_set=found.confused,
         where=where,
         remainder=remainder,
-        gap=_gap(measured, prepared, rollouts),
+        gap=_gap(found.measured, prepared, rollouts),
         candidates=seen,
         parameters=parameters,
         alarms=(*alarms, *more),
@@ -120,7 +119,7 @@ def assemble(
         ),
         audit=_audit(system, prepared, selection, begun=begun),
         strengths=found.strengths,
-        figures=figures(prepared, selection, measured),
+        figures=figures(prepared, selection, found.measured),
     )
 
 
@@ -284,6 +283,7 @@ def _effects(
     best = selection.best
     size = len(best.fit.point.z)
     errors = strength_errors(best.fit, best.dispersion(), size)
+    p_value = min(selection.p_values[0], _held_out(selection))
     found = []
     for name in dict.fromkeys(u.name for u in best.units):
         units = [u for u in best.units if u.name == name]
@@ -297,7 +297,7 @@ def _effects(
                 strength=mean,
                 unit=unit_at(units[0].effect, robot, int(np.argmax(units[0].direction))),
                 ci95=(mean - 1.96 * error, mean + 1.96 * error),
-                p_value=min(selection.p_values[0], _held_out(selection)),
+                p_value=p_value,
                 share_of_gap=max(0.0, credit.get(name, 0.0) * measured.explained),
                 strengths={u.where: s for u, s in zip(units, strengths, strict=True)},
             )

@@ -5,6 +5,7 @@ from __future__ import annotations
 __all__ = ["assumed_noise", "measured_noise"]
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -28,23 +29,42 @@ _ROUGHLY = 2.0  # times what third differences say
 _LIKE = 3  # sensors of one kind
 
 
+class _Known(NamedTuple):
+    """What is known of each channel's noise before any fit, shape ``(C,)`` each.
+
+    Attributes:
+        given: By the sensor's spec, NaN where it says nothing.
+        rough: By third differences.
+        tiny: Less than any sensor's.
+    """
+
+    given: Array
+    rough: Array
+    tiny: Array
+
+    @classmethod
+    def of(cls, predictor: Predictor, logs: Sequence[Log]) -> _Known:
+        robot, specified = predictor.system.robot, predictor.system.noise
+        rough = noise_from_differences(logs, [_coordinates(predictor, log) for log in logs])
+        given = np.array([specified.get(name, np.nan) for name in robot.channels])
+        return cls(given, rough, 1e-6 * robot.channel_scale.numpy())
+
+    @property
+    def assumed(self) -> Array:
+        return np.maximum(np.where(np.isnan(self.given), self.rough, self.given), self.tiny)
+
+
 def assumed_noise(predictor: Predictor, logs: Sequence[Log]) -> Array:
     """Return what the sensor's spec says, or else third differences, shape ``(C,)``."""
-    system = predictor.system
-    smooth = noise_from_differences(logs, [_coordinates(predictor, log) for log in logs])
-    given = np.array([system.noise.get(name, np.nan) for name in system.robot.channels])
-    tiny = 1e-6 * system.robot.channel_scale.numpy()
-    return np.maximum(np.where(np.isnan(given), smooth, given), tiny)
+    return _Known.of(predictor, logs).assumed
 
 
 def measured_noise(
     predictor: Predictor, logs: Sequence[Log], *, history: int, alarms: list[str]
 ) -> tuple[Array, str]:
     """Return each channel's noise: the differences of innovations, checked by the sensor's spec."""
-    system, noise = predictor.system, assumed_noise(predictor, logs)
-    rough = noise_from_differences(logs, [_coordinates(predictor, log) for log in logs])
-    channels, tiny = system.robot.channels, 1e-6 * system.robot.channel_scale.numpy()
-    given = np.array([system.noise.get(name, np.nan) for name in channels])
+    system, known = predictor.system, _Known.of(predictor, logs)
+    noise = known.assumed
     pieces = _pieces(logs, history=history)
     pushes = pushes_of(system.robot)
     z, estimate = origin(system.prior), noise
@@ -56,13 +76,13 @@ def measured_noise(
         points = [Point(z, {unit: 0.1 * unit.high}) for unit in pushes]
         pushed = objective(points) if points else np.zeros((0, *fit.innovations.shape))
         factor = innovation_noise(fit.innovations, pushed - fit.innovations, len(pieces.checked))
-        noise = np.maximum(noise * np.clip(factor, 1 / _AT_ONCE, _AT_ONCE), tiny)
-        estimate, noise = noise, np.minimum(noise, _most(noise, given, rough, system.robot))
+        noise = np.maximum(noise * np.clip(factor, 1 / _AT_ONCE, _AT_ONCE), known.tiny)
+        estimate, noise = noise, np.minimum(noise, _most(noise, known, system.robot))
         if np.abs(np.log(np.maximum(factor, 1e-9))).max() < _SETTLED:
             break
     apart = [
         f"{name}: {estimate:.3g} against {spec:.3g}"
-        for name, estimate, spec in zip(channels, estimate, given, strict=True)
+        for name, estimate, spec in zip(system.robot.channels, estimate, known.given, strict=True)
         if spec > 0 and not 0.7 < estimate / spec < 1.4
     ]
     if apart:
@@ -80,7 +100,7 @@ def _pieces(logs: Sequence[Log], *, history: int) -> Segments:
     return pieces
 
 
-def _most(noise: Array, given: Array, rough: Array, robot: Robot) -> Array:
+def _most(noise: Array, known: _Known, robot: Robot) -> Array:
     """Return what each channel's noise cannot exceed, shape ``(C,)``.
 
     Where a missing effect never rests, all that its joint does looks like noise, a hundred times
@@ -89,8 +109,8 @@ def _most(noise: Array, given: Array, rough: Array, robot: Robot) -> Array:
     third differences say, which hold the motion's as well, unless sensors are so coarse, or rest so
     much, that most of them are zero.
     """
-    most = np.where(given > 0, _BEYOND * given, np.inf)
-    most = np.minimum(most, np.where(rough > 0, _ROUGHLY * rough, np.inf))
+    most = np.where(known.given > 0, _BEYOND * known.given, np.inf)
+    most = np.minimum(most, np.where(known.rough > 0, _ROUGHLY * known.rough, np.inf))
     if robot.model is None:
         return most
     moved = {joint for joint in robot.joint_of_actuator if joint >= 0}
