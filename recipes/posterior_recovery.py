@@ -4,18 +4,17 @@
     python recipes/posterior_recovery.py
 
 Every method gets the same simulations with the same seeds. ``paper_mode=true``: the paper's
-protocol (1,000 trajectories of at most 200 steps, the mean of the statistics of 10 real ones), its
-networks with diagonal and full covariance, once with its own statistics and once with ours.
-Otherwise our defaults, beside sbi's NPE (extra ``sbi``) on the same pairs. Log-densities at one
-truth reward a posterior that is too sure, so nats over the prior and coverage over many other
-truths stand beside them. Writes result.json, table.md and a picture per problem; finished parts
-are kept in ``out``, so that the same command goes on after a break.
+protocol (1,000 trajectories of at most 200 steps, 10 real ones): its networks with diagonal and
+full covariance and the mean of the statistics of the real trajectories, once with its own
+statistics and once with ours; and "BayesSim pooled", our defaults, which multiply the posteriors
+of the ten. Otherwise our defaults, beside sbi's NPE (extra ``sbi``) on the same pairs.
+Log-densities at one truth reward a posterior that is too sure, so nats over the prior and coverage
+over many other truths stand beside them. Writes result.json, table.md and a picture per problem;
+finished parts are kept in ``out``, so that the same command goes on after a break.
 """
 
 from __future__ import annotations
 
-import math
-import statistics
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -29,6 +28,7 @@ from recovery_methods import (
     Answer,
     Fitted,
     bayessim,
+    bayessim_pooled,
     epsilon_free,
     from_draws,
     mcmc_abc,
@@ -37,6 +37,7 @@ from recovery_methods import (
     smc_abc,
 )
 from recovery_problems import PROBLEMS, Problem
+from recovery_table import BY_PRODUCT, joint, rows, table
 from torch import Tensor
 from workers import workers
 
@@ -52,6 +53,7 @@ from torchrl_bayessim.whole_file import write_text
 
 REAL = 10  # real trajectories of the paper
 PAPER = ", the paper's statistics"
+POOLED = 16  # other truths that it is tried on: its products take long
 
 
 @dataclass
@@ -122,8 +124,8 @@ class Laboratory:
 
     Args:
         problem: The problem.
-        paper: Whether statistics of single trajectories are averaged, as in the paper; both kinds
-            of statistics then stand side by side.
+        paper: Whether a system shows one trajectory, and the robot several, as in the paper; both
+            kinds of statistics then stand side by side.
         environments: Simulated at once.
         seed: Of the simulations.
     """
@@ -139,19 +141,19 @@ class Laboratory:
         self.calls = 0
 
     def __call__(self, theta: Tensor, *, real: bool = False) -> Tensor:
-        """Return summaries ``(N, L)``; of as many trajectories as the robot runs if ``real``."""
+        """Return summaries ``(N, R, L)`` of R = 1 trajectory, or as many as the robot runs."""
         self.calls += 1
-        mean_of = REAL if self.paper and real else 1
+        runs = REAL if self.paper and real else 1
         found, _ = collect_summaries(
             self.collector,
             self.statistics,
             self.randomizer,
-            theta.repeat_interleave(mean_of, 0),
+            theta.repeat_interleave(runs, 0),
             trajectories=1 if self.paper else self.problem.episodes,
             key=(self.seed, "laboratory", self.calls),
             progress=False,
         )
-        return found.unflatten(0, (len(theta), mean_of)).mean(1)
+        return found.unflatten(0, (len(theta), runs))
 
     def close(self) -> None:
         """End the collector."""
@@ -175,7 +177,7 @@ def answered(settings: Recovery, name: str, seed: int) -> dict[str, Any]:
     width = min(problem.environments, settings.simulations)
     lab = Laboratory(problem, paper=settings.paper_mode, environments=width, seed=seed)
     theta = draw(prior, settings.simulations, key=(seed, "theta"))
-    x = lab(theta)
+    x = lab(theta)[:, 0]
     seconds = time.perf_counter() - start
     truth = torch.tensor([[problem.truth[n] for n in prior.names]])
     # the last row is the truth of the table
@@ -184,22 +186,24 @@ def answered(settings: Recovery, name: str, seed: int) -> dict[str, Any]:
     found: dict[str, Any] = {}
     pictured: dict[str, Any] = {}
     for kind, columns in kinds(lab, x).items():
-        own, given = x[:, columns], observed[:, columns]
-        for method, make in amortised(settings, prior, theta, own, seed=seed).items():
+        own, given = x[:, columns], observed[..., columns]
+        methods = amortised(settings, prior, theta, own, pooled=kind != PAPER, seed=seed)
+        for method, make in methods.items():
             before = time.process_time()
-            fitted, network = make()
+            fitted, condition = make()
             spent = time.process_time() - before
-            found[f"{method}{kind}"] = entry(fitted(tests, given), prior, tests) | {
-                "seconds_fit": spent
-            }
-            if network is not None:
-                pictured["posterior"] = network.condition(given[-1:])
+            few = slice(-1 - POOLED if method == BY_PRODUCT else 0, None)
+            answer = fitted(tests[few], given[few])
+            found[f"{method}{kind}"] = entry(answer, prior, tests[few]) | {"seconds_fit": spent}
+            if condition is not None:
+                pictured["posterior"] = condition(given[-1])
         if settings.paper_mode and settings.online and not problem.costly and kind != PAPER:
-            few = Laboratory(problem, paper=settings.paper_mode, environments=100, seed=seed)
-            alone = lambda t, few=few, columns=columns: few(t)[:, columns]
-            for method, answer in online(settings, prior, alone, given[-1], truth=truth, seed=seed):
+            small = Laboratory(problem, paper=settings.paper_mode, environments=100, seed=seed)
+            alone = lambda t, small=small, columns=columns: small(t)[:, 0, columns]
+            mean = given[-1].mean(0)
+            for method, answer in online(settings, prior, alone, mean, truth=truth, seed=seed):
                 found[f"{method}{kind}"] = entry(answer, prior, truth) | {"seconds_fit": None}
-            few.close()
+            small.close()
     lab.close()
     q = pictured["posterior"]
     return {
@@ -229,9 +233,9 @@ def kinds(lab: Laboratory, x: Tensor) -> dict[str, slice]:
 
 
 def amortised(
-    settings: Recovery, prior: Any, theta: Tensor, x: Tensor, *, seed: int
+    settings: Recovery, prior: Any, theta: Tensor, x: Tensor, *, pooled: bool, seed: int
 ) -> dict[str, Callable[[], tuple[Fitted, Any]]]:
-    """Return the methods that answer for any summary, by name."""
+    """Return the methods that answer for any summary, by name; the pooling one if asked."""
     made: dict[str, Callable[[], tuple[Fitted, Any]]] = {}
 
     def network(features: str, covariance: str) -> Callable[[], tuple[Fitted, Any]]:
@@ -246,12 +250,14 @@ def amortised(
         )
 
     several = len(prior.names) > 1
-    if settings.paper_mode:
+    if not settings.paper_mode:
+        made["BayesSim"] = network("neural", "full")
+    else:
         for label, features in {"RFF": "fourier", "NN": "neural"}.items():
             for covariance in ("diagonal", "full") if several else ("diagonal",):
                 made[f"BayesSim {label} {covariance}"] = network(features, covariance)
-    else:
-        made["BayesSim"] = network("neural", "full")
+        if pooled:
+            made[BY_PRODUCT] = lambda: bayessim_pooled(prior, theta, x, seed=seed)
     made["Rejection ABC"] = lambda: (rejection_abc(prior, theta, x), None)
     if settings.npe and not settings.paper_mode:
         for kind in ("mdn", "maf", "nsf"):
@@ -292,57 +298,6 @@ def entry(answer: Answer, prior: Any, tests: Tensor) -> dict[str, Any]:
     }
 
 
-def rows(parts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Yield one row per problem, parameter and method."""
-    for name in dict.fromkeys(part["problem"] for part in parts):
-        own = [part for part in parts if part["problem"] == name]
-        problem = PROBLEMS[name]
-        for d, parameter in enumerate(problem.prior.names):
-            for method in own[0]["methods"]:
-                entries = [part["methods"][method] for part in own]
-                at_truth = [e["log_prob"][d] for e in entries]
-                nats = [row[d] for e in entries for row in e["nats"]]
-                place = torch.tensor([row[d] for e in entries for row in e["place"]])
-                fits = [e["seconds_fit"] for e in entries]
-                yield {
-                    "problem": name,
-                    "parameter": parameter,
-                    "method": method,
-                    "log_prob_mean": statistics.fmean(at_truth),
-                    "log_prob_sd": statistics.stdev(at_truth) if len(at_truth) > 1 else None,
-                    "nats_over_prior": statistics.fmean(nats) if nats else None,
-                    "coverage_50": covered(place, 0.5),
-                    "coverage_90": covered(place, 0.9),
-                    "truths": len(place),
-                    "seconds_simulate": statistics.fmean(p["seconds_simulate"] for p in own),
-                    "seconds_fit": None if None in fits else statistics.fmean(fits),
-                    "simulations": own[0]["simulations"],
-                    "seeds": len(own),
-                    "paper_best": problem.paper[parameter],
-                    "prior": -math.log(problem.prior.high[d] - problem.prior.low[d]),
-                }
-
-
-def covered(place: Tensor, level: float) -> float | None:
-    """Return the share of truths in central intervals of this level."""
-    return ((place - 0.5).abs() <= level / 2).float().mean().item() if len(place) else None
-
-
-def joint(parts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Yield nats over the prior of all parameters together, and the time to fit, per method."""
-    for name in dict.fromkeys(part["problem"] for part in parts):
-        own = [part for part in parts if part["problem"] == name]
-        for method in own[0]["methods"]:
-            entries = [part["methods"][method] for part in own]
-            if all(e["joint_nats"] for e in entries):
-                yield {
-                    "problem": name,
-                    "method": method,
-                    "nats": statistics.fmean(v for e in entries for v in e["joint_nats"]),
-                    "seconds_fit": statistics.fmean(e["seconds_fit"] for e in entries),
-                }
-
-
 def draw_picture(out: Path, part: dict[str, Any]) -> None:
     """Draw the posterior of the last network fitted."""
     problem = PROBLEMS[part["problem"]]
@@ -353,49 +308,6 @@ def draw_picture(out: Path, part: dict[str, Any]) -> None:
         truth=torch.tensor([problem.truth[n] for n in problem.prior.names]),
     )
     recipe.save_picture(figure, out / f"{part['problem']}.png", dpi=80)
-
-
-def table(result: dict[str, Any], names: list[str]) -> str:
-    """Return the tables in Markdown."""
-    lines = [
-        "Log-density at the truth, mean ± deviation over seeds; in brackets nats over the prior, "
-        "averaged over other truths, and how many of these 50 % and 90 % intervals hold.",
-        "",
-    ]
-    for name in names:
-        found = [row for row in result["rows"] if row["problem"] == name]
-        parameters = list(dict.fromkeys(row["parameter"] for row in found))
-        lines += [f"**{name}**", "", f"| method | {' | '.join(parameters)} | fit [s] |"]
-        lines += ["|---" * (len(parameters) + 2) + "|"]
-        best = {row["parameter"]: row["paper_best"] for row in found}
-        flat = {row["parameter"]: row["prior"] for row in found}
-        lines += [f"| prior | {' | '.join(f'{flat[p]:.2f}' for p in parameters)} | |"]
-        lines += [f"| paper, best | {' | '.join(f'{best[p]:.2f}' for p in parameters)} | |"]
-        for method in dict.fromkeys(row["method"] for row in found):
-            own = [row for row in found if row["method"] == method]
-            spent = own[0]["seconds_fit"]
-            cells = " | ".join(cell(row) for row in own)
-            lines += [f"| {method} | {cells} | {'' if spent is None else f'{spent:.1f}'} |"]
-        lines += ["", *(f"- {text}" for text in result["said"].get(name, [])), ""]
-    lines += ["All parameters together, nats over the prior averaged over other truths:", ""]
-    lines += ["| problem | method | nats | fit [s] |", "|---|---|---|---|"]
-    lines += [
-        f"| {row['problem']} | {row['method']} | {row['nats']:.2f} | {row['seconds_fit']:.1f} |"
-        for row in result["joint"]
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def cell(row: dict[str, Any]) -> str:
-    """Return one row's cell."""
-    sd = "" if row["log_prob_sd"] is None else f" ± {row['log_prob_sd']:.2f}"
-    text = f"{row['log_prob_mean']:.2f}{sd}"
-    if row["nats_over_prior"] is None:
-        return text
-    return (
-        f"{text} [{row['nats_over_prior']:+.2f}; "
-        f"{row['coverage_50']:.0%}, {row['coverage_90']:.0%}]"
-    )
 
 
 if __name__ == "__main__":

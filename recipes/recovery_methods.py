@@ -21,6 +21,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_bayessim.inference.calibration import calibrate
+from torchrl_bayessim.inference.ensemble import average
 from torchrl_bayessim.inference.fit import fit, select_lengthscale
 from torchrl_bayessim.inference.marginals import marginal_log_prob
 from torchrl_bayessim.inference.physics_posterior import PhysicsPosterior
@@ -33,6 +34,7 @@ from torchrl_bayessim.sources import draw
 Simulator = Callable[[Tensor], Tensor]
 ACCEPTED = 0.05  # share of the simulations that Rejection ABC accepts
 DRAWS = 200
+NETWORKS = 3  # averaged where trajectories are pooled
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,12 @@ class Answer:
 
 
 Fitted = Callable[[Tensor, Tensor], Answer]
-"""Truths ``(N, D)`` and their summaries ``(N, L)`` to an answer."""
+"""Truths ``(N, D)`` and the summaries ``(N, R, L)`` of R trajectories of each to an answer.
+
+R is 1, or the method takes the mean of the R summaries, as the paper does, unless it pools.
+"""
+Conditioned = Callable[[Tensor], PhysicsPosterior]
+"""Summaries ``(R, L)`` of the real trajectories to the posterior."""
 
 
 def bayessim(
@@ -63,7 +70,7 @@ def bayessim(
     covariance: Literal["diagonal", "full"],
     paper: bool,
     seed: int,
-) -> tuple[Fitted, MixtureDensityPosterior]:
+) -> tuple[Fitted, Conditioned]:
     """Fit BayesSim's network with the paper's choices or our defaults."""
     size = x.shape[-1]
     pairs = TensorDict({"theta": theta, "summary": x}, [len(theta)])
@@ -87,12 +94,45 @@ def bayessim(
 
     @torch.no_grad()
     def answer(truth: Tensor, summary: Tensor) -> Answer:
-        q = network.distribution(summary)
-        test = TensorDict({"theta": truth, "summary": summary}, [len(truth)])
+        mean = summary.mean(1)
+        q = network.distribution(mean)
+        test = TensorDict({"theta": truth, "summary": mean}, [len(truth)])
         place = calibrate(network, test, draws=DRAWS, seed=seed).rank
         return Answer(marginal_log_prob(q, truth), place, q.log_prob(truth))
 
-    return answer, network
+    return answer, lambda summary: network.condition(summary, pooling="mean")
+
+
+def bayessim_pooled(
+    prior: BoxPrior, theta: Tensor, x: Tensor, *, seed: int
+) -> tuple[Fitted, Conditioned]:
+    """Fit our default networks, which answer by the posterior of all trajectories together.
+
+    The product takes trajectories for independent, but what a network got wrong is the same in all
+    of them. Several networks got different things wrong: their average is less sure.
+    """
+    pairs = TensorDict({"theta": theta, "summary": x}, [len(theta)])
+    networks = []
+    for fitted in range(NETWORKS * seed, NETWORKS * (seed + 1)):
+        network = MixtureDensityPosterior(prior, x.shape[-1], seed=fitted)
+        fit(network, pairs, seed=fitted, progress=False)
+        networks.append(network)
+
+    def condition(summary: Tensor) -> PhysicsPosterior:
+        members = [network.condition(summary, check=False).mixture for network in networks]
+        return PhysicsPosterior(average(members), prior)
+
+    @torch.no_grad()
+    def answer(truth: Tensor, summary: Tensor) -> Answer:
+        g = generator(seed, "pooled")
+        found = []
+        for own, several in zip(truth, summary, strict=True):
+            q = condition(several)
+            place = (q.sample((DRAWS,), generator=g) < own).float().mean(0)
+            found.append((marginal_log_prob(q, own), place, q.log_prob(own)))
+        return Answer(*(torch.stack(part) for part in zip(*found, strict=True)))
+
+    return answer, condition
 
 
 def rejection_abc(prior: BoxPrior, theta: Tensor, x: Tensor) -> Fitted:
@@ -104,7 +144,7 @@ def rejection_abc(prior: BoxPrior, theta: Tensor, x: Tensor) -> Fitted:
         return ((values - median) / spread).clamp(-10, 10)
 
     def answer(truth: Tensor, summary: Tensor) -> Answer:
-        distance = torch.cdist(scaled(summary), scaled(x))
+        distance = torch.cdist(scaled(summary.mean(1)), scaled(x))
         nearest = distance.topk(round(ACCEPTED * len(x)), largest=False).indices
         return from_draws(prior, truth, theta[nearest].transpose(0, 1))
 
@@ -145,6 +185,7 @@ def npe(
 
     @torch.no_grad()
     def answer(truth: Tensor, summary: Tensor) -> Answer:
+        summary = summary.mean(1)
         with isolated(seed, "sbi draws", kind):
             draws = estimator.sample((2 * DRAWS,), condition=summary)
         inside = prior.contains(draws)

@@ -81,6 +81,24 @@ def test_a_missing_part_is_run_again_to_the_same_numbers_and_no_other(
     same_numbers(tmp_path / "run", finished[0] / "run")
 
 
+def test_by_the_papers_protocol_ten_trajectories_together_tell_more_than_their_mean(tmp_path):
+    status, _, err = run(
+        *("short=true", "paper_mode=true", "problem=pendulum", "online=false", "out=run"),
+        folder=tmp_path,
+    )
+    assert status == 0, err
+    rows = json.loads((tmp_path / "run/result.json").read_text())["rows"]
+    found = {row["method"]: row for row in rows}
+    (pooled,) = (row for name, row in found.items() if name.startswith("BayesSim pooled"))
+    mean = found["BayesSim NN diagonal, our statistics"]
+    assert pooled["nats_over_prior"] > 0.3 + mean["nats_over_prior"]
+    assert pooled["coverage_90"] > 0.6
+    assert "Rejection ABC, the paper's statistics" in found
+    table = (tmp_path / "run/table.md").read_text()
+    best = max(row["log_prob_mean"] for row in rows)
+    assert f"| pendulum, dt | 3.20 | {best:.2f} |" in table
+
+
 def test_parts_of_other_methods_are_other_parts(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(RECIPE.parent)
     import posterior_recovery
