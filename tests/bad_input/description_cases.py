@@ -100,6 +100,7 @@ def values():
         "negative mass": ("[0.3, 0.8]", "[-0.8, -0.3]", "body_mass"),
         "bounds of a list": ("[0.3, 0.8]", "[[0.3], 0.8]", "a number under"),
         "an unknown field": ("body_mass[link]", "body_weight[link]", "body_weight"),
+        "the time step": ("body_mass[link]", "opt.timestep", "got 'opt.timestep'"),
         "a mass of no body": ("body_mass[link]", "body_mass[hand]", "a body, got 'hand'"),
         "no entry": ("body_mass[link]", "mass", "mass"),
         "an open bracket": ("body_mass[link]", "'body_mass[link'", "body_mass[link"),

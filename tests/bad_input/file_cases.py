@@ -127,7 +127,7 @@ def parquets():
         yield spoilt(f"Parquet without {name}", said, lambda p, name=name: _without(p, name))
     yield spoilt("Parquet without rows", "rows in run2.parquet", _empty)
     yield spoilt("Parquet with a column twice", "each column once in run2.parquet", _twice)
-    yield spoilt("100 million rows in little Parquet", "rows in run2.parquet", _bomb)
+    yield spoilt("100 million rows in little Parquet", "rows of 4 columns in run2.parquet", _bomb)
     empty = in_place_of_one("run2.parquet", lambda p: parquet(p, q=[None] * len(words)))
     yield Case(name="Parquet of nothing", spoil=empty, found=("run2.parquet short",))
 

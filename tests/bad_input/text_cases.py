@@ -31,7 +31,8 @@ def cut_off():
     for row, more in (60, 0), (100, 1), (100, 4), (140, 8):  # a number of which a part is left
         cut = LOG[: cell_start(row, 3) + more]
         name = f"cut in row {row} after {more} of the last cell"
-        yield Case(name=name, spoil=put(cut), found=("run2.csv missing",))
+        said = f"a number in row {row}, column 'tau' of run2.csv, got '"
+        yield Case(name=name, spoil=put(cut), said=said)
     for row in 3, 8:
         cut = LOG[: cell_start(row, 0)]
         name = f"cut after row {row - 1}"

@@ -120,6 +120,13 @@ def test_no_sensor_is_much_worse_than_its_spec():
     assert any("bthigh velocity" in alarm for alarm in alarms)
 
 
+def test_a_spec_that_no_sensor_has_says_nothing():
+    *_, true = cheetah()
+    tiny, none = (cheetah(noise=spec)[:2] for spec in (1e-300 * true, None))
+    found = [assumed_noise(Predictor(system), logs) for system, logs in (tiny, none)]
+    np.testing.assert_array_equal(*found)
+
+
 def test_a_sensor_may_be_twice_as_bad_as_its_spec():
     *_, true = cheetah()
     system, logs, _ = cheetah(noise=0.5 * true)

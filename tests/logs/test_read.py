@@ -9,13 +9,14 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from tensordict import NonTensorData, TensorDict
+from tensordict import NonTensorData, TensorDict, lazy_stack
 
 from torchrl_bayessim.logs.columns import Columns
 from torchrl_bayessim.logs.read import read_logs, read_records
 from torchrl_bayessim.logs.system import System
 
 ROWS = "t,q,qd,tau,note\n0.00,0.1,0.0,1.0,7\n0.01,0.1,0.1,1.0,7\n0.02,0.1,0.2,0.5,7\n"
+CUT = "t,q,qd,tau\n0.00,0.1,0.0,1.0\n0.01,0.1,0.1,0.5"
 
 
 @pytest.fixture
@@ -44,6 +45,7 @@ def test_a_folder_is_read_in_order(write, tmp_path, pendulum):
     write(ROWS, "b.csv")
     write(ROWS, "a.csv")
     write("no log", "README.md")
+    write(b"\0\5\26\7 Mac OS X", "._a.csv")
     assert [record.name for record in read_records(tmp_path, pendulum)] == ["a.csv", "b.csv"]
     files = [tmp_path / "b.csv", str(tmp_path / "a.csv")]
     assert [record.name for record in read_records(files, pendulum)] == ["b.csv", "a.csv"]
@@ -63,11 +65,23 @@ def test_a_folder_is_read_in_order(write, tmp_path, pendulum):
         (ROWS.encode("utf-16"), "UTF-8"),
         (ROWS.replace("0.02,", "0.005,"), "increasing time in log.csv, got '0.005 s after"),
         (ROWS.replace("0.1,", "nan,"), "that can be used"),
+        (
+            ROWS.replace(",note", "").replace(",7\n", "\n")[:-1],
+            r"column 'tau' of log.csv, got '\S+ and no line end: is it cut off",
+        ),
     ],
 )
 def test_malformed_csv_is_named(write, pendulum, text, match):
     with pytest.raises(ValueError, match=match):
         read_logs(write(text), pendulum)
+
+
+def test_cells_left_empty_at_the_ends_of_rows_are_no_columns(write, pendulum):
+    plain, padded = (
+        read_logs(write(ROWS), pendulum),
+        read_logs(write(ROWS.replace("\n", ",,\n"), "padded.csv"), pendulum),
+    )
+    torch.testing.assert_close(padded[0].qpos, plain[0].qpos)
 
 
 def test_of_many_columns_the_first_by_name_that_is_there_twice_is_named(write, pendulum):
@@ -116,6 +130,21 @@ def test_a_tensordict_is_cut_where_an_episode_ends(tmp_path, pendulum):
     saved = read_logs(tmp_path / "saved", pendulum)
     assert [log.name for log in saved] == ["saved[0]", "saved[1]", "saved[2]"]
     torch.testing.assert_close(saved[2].ctrl, logs[2].ctrl)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda data: data.to("meta"), "dense tensors that hold values in tensordict, got .*meta"),
+        (lambda data: data.set("q", data["q"].to_sparse()), "got 'one that is torch.sparse_coo'"),
+        (lambda data: lazy_stack([data, data[:5]]), "trajectories of one length in tensordict"),
+    ],
+)
+def test_tensors_that_cannot_be_read_are_named(pendulum, change, match):
+    names = ("t", "q", "qd", "tau")
+    data = TensorDict({name: torch.zeros(20, 1) for name in names}, batch_size=[20])
+    with pytest.raises(ValueError, match=match):
+        read_logs(change(data), pendulum)
 
 
 def test_what_a_batch_cuts_off_an_episode_is_left_out(pendulum):

@@ -81,6 +81,7 @@ ENTRIES = {
             "findings": (),
             "mode": None,
             "horizon": None,
+            "seed": 0,
         },
         {
             "simulator": "object",
@@ -89,6 +90,7 @@ ENTRIES = {
             "effects": "names or none",
             "mode": "name or none",
             "horizon": "count or none",
+            "seed": "count or zero",
         },
     ),
 }

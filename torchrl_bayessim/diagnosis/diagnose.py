@@ -80,6 +80,8 @@ def diagnose(
         check_choice("a mode of the diagnosis", mode, MODES)
     if horizon is not None:
         check_count("horizon", horizon)
+    check_kind("a whole number as the seed", seed, int)
+    check_count("seed", seed, least=0)
     check_kind("a sequence of logs", logs, list, tuple)
     for log in logs:
         _check_log(log)

@@ -33,7 +33,7 @@ class _Known(NamedTuple):
     """What is known of each channel's noise before any fit, shape ``(C,)`` each.
 
     Attributes:
-        given: By the sensor's spec, NaN where it says nothing.
+        given: By the sensor's spec, NaN where it says nothing, or less than any sensor's.
         rough: By third differences.
         tiny: Less than any sensor's.
     """
@@ -47,7 +47,8 @@ class _Known(NamedTuple):
         robot, specified = predictor.system.robot, predictor.system.noise
         rough = noise_from_differences(logs, [_coordinates(predictor, log) for log in logs])
         given = np.array([specified.get(name, np.nan) for name in robot.channels])
-        return cls(given, rough, 1e-6 * robot.channel_scale.numpy())
+        tiny = 1e-6 * robot.channel_scale.numpy()
+        return cls(np.where(given > tiny, given, np.nan), rough, tiny)
 
     @property
     def assumed(self) -> Array:

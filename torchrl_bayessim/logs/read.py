@@ -84,7 +84,9 @@ def _tables(path: Path, system: System) -> list[Table]:
         raise ValueError(message("a folder or file of logs", str(path)))
     if (path / "data" / "metadata.json").is_file():
         return dataset_tables(path, system)
-    files = sorted(file for file in path.iterdir() if file.suffix.lower() in _READERS)
+    # hidden ones are an editor's or a system's, such as ._run0.csv beside run0.csv
+    shown = (file for file in path.iterdir() if not file.name.startswith("."))
+    files = sorted(file for file in shown if file.suffix.lower() in _READERS)
     if files:
         return [_file_table(file, system) for file in files]
     if (path / "meta.json").is_file():

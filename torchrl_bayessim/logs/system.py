@@ -73,8 +73,8 @@ class System:
     Raises:
         TypeError: A part is of another kind.
         ValueError: The columns or the noise do not fit the model, the prior is over other
-            parameters than the physics, an effect is named twice, or the task's actions are not its
-            controls.
+            parameters than the physics or over the time step, an effect is named twice, or the
+            task's actions are not its controls.
         PhysicsError: The model has no such parameter.
     """
 
@@ -103,6 +103,10 @@ class System:
         physics = None if self.physics is None else self.physics.names
         if names != physics:
             raise ValueError(message(f"a prior over the physics {physics}", names))
+        if self.physics is not None and "opt.timestep" in self.physics.fields:
+            hint = "the effect time_scale, for a clock that runs wrong"
+            expected = "parameters of the robot, not of the simulation"
+            raise ValueError(message(expected, "opt.timestep", hint=hint))
         known = [channel.name for channel in self._channels]
         for name, value in self.noise.items():
             if name not in known:

@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 _BATCH = 50_000  # rows that are held as text
 _LONGEST = 1_000_000  # characters of a line
 _STUMP = 10  # rows of what is left of an episode beside longer ones, too few for anything
-_MOST = 100_000_000  # rows: a day at 1 kHz
+_MOST = 100_000_000  # numbers: ten of them at 1 kHz for almost three hours
 
 
 class Table(NamedTuple):
@@ -53,13 +53,12 @@ class Table(NamedTuple):
 def read_csv(path: Path, names: list[str]) -> Table:
     """Return columns of a CSV file with a header row.
 
-    An empty cell is NaN, and so is the last cell of a file that does not end with a line end, which
-    may be cut off.
+    An empty cell is NaN. The last number of a file without a line end may be cut off, and is none.
 
     Raises:
         ValueError: The file cannot be read, is empty or not text in UTF-8, has a column twice, a
-            row with another number of cells or a cell that is not a number, or lacks one of
-            ``names``.
+            row with another number of cells, a cell that is not a number or may be cut off, or
+            lacks one of ``names``.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -80,7 +79,7 @@ def _lines(file: TextIO, name: str) -> Iterator[str]:
             if len(line) == _LONGEST:
                 expected = f"lines of fewer than {_LONGEST} characters in {name}"
                 raise ValueError(message(expected, "a longer one"))
-            line = f'{line[: line.rfind(",") + 1]}""'
+            line += " and no line end: is it cut off?"
         yield line
 
 
@@ -105,7 +104,7 @@ def _columns(rows: Iterator[list[str]], names: list[str], file: str) -> dict[str
             cells = [row[column].strip() or "nan" for row in batch]
             parts[name].append(_numbers(cells, start, f"column {name!r} of {file}"))
         start += len(batch)
-        _check_count(start, file)
+        _check_count(start, names, file)
         batch = list(islice(rows, _BATCH))
     return {name: np.concatenate(part) for name, part in parts.items()}
 
@@ -141,7 +140,7 @@ def read_parquet(path: Path, names: list[str]) -> Table:
         hint = "pip install torchrl_bayessim[recipes]"
         raise ImportError(message("pyarrow, to read Parquet", "none", hint=hint)) from None
     try:
-        _check_count(parquet.read_metadata(path).num_rows, path.name)
+        _check_count(parquet.read_metadata(path).num_rows, names, path.name)
         header = parquet.read_schema(path).names
         _check_twice(header, path.name)
         _check_names(names, header, path.name)
@@ -210,7 +209,8 @@ def tensordict_tables(data: TensorDictBase | Path, system: System) -> list[Table
     beside longer ones of the same batch entry: what its size has cut off.
 
     Raises:
-        ValueError: There is no batch dimension, the folder holds no tensordict or pickles, or the
+        ValueError: There is no batch dimension, trajectories of a lazy stack differ in length, an
+            entry is sparse or has no values, the folder holds no tensordict or pickles, or the
             trajectories lack one of the system's columns.
     """
     name = "tensordict"
@@ -219,8 +219,13 @@ def tensordict_tables(data: TensorDictBase | Path, system: System) -> list[Table
         data = saved_tensordict(data)
     if not data.ndim:
         raise ValueError(message(f"a tensordict of batch size (*, T) in {name}", "none"))
+    if -1 in data.shape:
+        hint = "read_logs(part, system) of each, and add the lists"
+        expected = f"trajectories of one length in {name}"
+        raise ValueError(message(expected, f"a batch size of {tuple(data.shape)}", hint=hint))
     if 0 in data.shape:
         return []
+    _check_dense(data, name)
     done = data.get(("next", "done"), None)
     rows = data.exclude("next").reshape(-1, data.shape[-1])
     ends = torch.zeros(rows.shape) if done is None else done.reshape(*rows.shape, -1).any(-1)
@@ -236,6 +241,17 @@ def tensordict_tables(data: TensorDictBase | Path, system: System) -> list[Table
             label = f"{name}[{len(tables)}]"
             tables.append(_table(label, arrays, system))
     return tables
+
+
+def _check_dense(data: TensorDictBase, name: str) -> None:
+    for value in data.values(include_nested=True, leaves_only=True):
+        if not isinstance(value, torch.Tensor):
+            continue
+        kind = "nested" if value.is_nested else str(value.layout)
+        kind = "meta" if value.is_meta else kind
+        if kind != str(torch.strided):
+            expected = f"dense tensors that hold values in {name}"
+            raise ValueError(message(expected, f"one that is {kind}"))
 
 
 def _episodes(ends: torch.Tensor) -> list[tuple[int, int]]:
@@ -300,14 +316,17 @@ def _no_number(column: str, file: str) -> ValueError:
     return ValueError(message(f"numbers in column {column!r} of {file}", "booleans", hint=hint))
 
 
-def _check_count(rows: int, file: str) -> None:
-    if rows > _MOST:
+def _check_count(rows: int, names: list[str], file: str) -> None:
+    most = _MOST // len(names)
+    if rows > most:
         hint = "write several shorter logs"
-        raise ValueError(message(f"at most {_MOST} rows in {file}", rows, hint=hint))
+        expected = f"at most {most} rows of {len(names)} columns in {file}"
+        raise ValueError(message(expected, rows, hint=hint))
 
 
 def _check_twice(header: list[str], file: str) -> None:
-    twice = sorted(name for name, count in Counter(header).items() if count > 1)
+    # cells that a program has left empty at the ends of all rows have no names
+    twice = sorted(name for name, count in Counter(header).items() if name and count > 1)
     if twice:
         raise ValueError(message(f"each column once in {file}", twice[0]))
 

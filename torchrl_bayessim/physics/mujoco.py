@@ -80,10 +80,14 @@ class MujocoPhysics:
             raise ValueError(message("parameters, each once and with a target", self.names))
 
     @property
+    def fields(self) -> frozenset[str]:
+        """The fields of the model whose entries are set, such as ``body_mass``."""
+        return frozenset(_field(target) for group in self._targets for target in group)
+
+    @property
     def units(self) -> tuple[str, ...]:
         """The parameters' SI units, of hinges for joints; empty where they depend on the model."""
-        fields = [group[0].lstrip("-").split("[")[0] for group in self._targets]
-        return tuple(_UNITS.get(field, "") for field in fields)
+        return tuple(_UNITS.get(_field(group[0]), "") for group in self._targets)
 
     def write(
         self, env: EnvBase, theta: Tensor, *, mask: Tensor, tensordict: TensorDictBase
@@ -121,3 +125,7 @@ class MujocoPhysics:
             groups = [[resolve(models.model, t) for t in group] for group in self._targets]
             known = models.resolved[self._targets] = assignments(models, groups)
         return models, known
+
+
+def _field(target: str) -> str:
+    return target.lstrip("-").split("[")[0]
