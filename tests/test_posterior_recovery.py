@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
+import numpy as np
 import pytest
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "posterior_recovery.py"
@@ -97,6 +99,19 @@ def test_by_the_papers_protocol_ten_trajectories_together_tell_more_than_their_m
     table = (tmp_path / "run/table.md").read_text()
     best = max(row["log_prob_mean"] for row in rows)
     assert f"| pendulum, dt | 3.20 | {best:.2f} |" in table
+
+
+def test_a_robot_that_has_fallen_goes_on(monkeypatch):
+    monkeypatch.syspath_prepend(RECIPE.parent)
+    from recovery_problems import GoesOn
+
+    push = np.ones(1, dtype=np.float32)
+    over = {}
+    for kind in (lambda env: env, GoesOn):
+        env = kind(gymnasium.make("InvertedPendulum-v5"))
+        env.reset(seed=0)
+        over[kind] = [any(env.step(push)[2:4]) for _ in range(20)]
+    assert [any(steps) for steps in over.values()] == [True, False]
 
 
 def test_parts_of_other_methods_are_other_parts(tmp_path, monkeypatch):
