@@ -226,7 +226,8 @@ def reduce(mixture: Mixture, components: int) -> Mixture:
     r"""Return an unbatched mixture of at most ``components``, by merging near pairs.
 
     Greedy, by the upper bound on the Kullback-Leibler loss of a merge (Runnalls, 2007, "Kullback-
-    Leibler approach to Gaussian mixture reduction", IEEE T-AES 43, eq. 16):
+    Leibler approach to Gaussian mixture reduction", IEEE T-AES 43, eq. 16), some pairs at once of
+    which each component is the other's nearest:
     :math:`B_{ij} = \tfrac12[(\alpha_i + \alpha_j)\log|\Sigma_{ij}| - \alpha_i\log|\Sigma_i| -
     \alpha_j\log|\Sigma_j|]`. Components that together hold less than 1e-9 are dropped first.
 
@@ -245,20 +246,39 @@ def reduce(mixture: Mixture, components: int) -> Mixture:
     parts = (logits[:keep].exp(), mixture.loc[order[:keep]], mixture.covariance[order[:keep]])
     cost = _merge_cost(parts, parts).fill_diagonal_(torch.inf)
     while len(cost) > components:
-        i, j = divmod(int(cost.argmin()), len(cost))
-        merged = _merge(*(part[[i, j]] for part in parts))
-        rest = [k for k in range(len(cost)) if k not in {i, j}]
+        one, other = _nearest_pairs(cost, math.ceil((len(cost) - components) / 6))
+        rest = torch.ones(len(cost), dtype=torch.bool)
+        rest[one] = rest[other] = False
+        merged = _merge(tuple(part[one] for part in parts), tuple(part[other] for part in parts))
         parts = tuple(torch.cat([part[rest], new]) for part, new in zip(parts, merged, strict=True))
-        row = _merge_cost(merged, parts)
-        cost = torch.cat([torch.cat([cost[rest][:, rest], row[:, :-1].mT], 1), row])
+        rows = _merge_cost(merged, parts)
+        size = len(cost) - 2 * len(one)
+        cost = torch.cat([torch.cat([cost[rest][:, rest], rows[:, :size].mT], 1), rows])
         cost.fill_diagonal_(torch.inf)
     weight, loc, cov = parts
     return Mixture(weight.log().log_softmax(-1), loc, _cholesky(cov))
 
 
-def _merge(weight: Tensor, loc: Tensor, cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    mean, covariance = _moments(Mixture(weight.log(), loc, _cholesky(cov)))
-    return weight.sum(0, keepdim=True), mean[None], covariance[None]
+def _nearest_pairs(cost: Tensor, most: int) -> tuple[Tensor, Tensor]:
+    """Return pairs of which each is the other's nearest, the best of them, at least one."""
+    least, nearest = cost.min(1)
+    own = torch.arange(len(cost))
+    first = ((nearest[nearest] == own) & (own < nearest)).nonzero()[:, 0]
+    first = first[least[first].argsort()][:most]
+    if not len(first):  # ties
+        first = least.argmin()[None]
+    return first, nearest[first]
+
+
+def _merge(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the components into which pairs of them merge, by their moments."""
+    (one, loc, cov), (other, its_loc, its_cov) = first, second
+    weight = one + other
+    share = (one / weight)[:, None]
+    between = loc - its_loc
+    outer = (share * (1 - share))[..., None] * between[..., None] * between[..., None, :]
+    mean = share * loc + (1 - share) * its_loc
+    return weight, mean, share[..., None] * cov + (1 - share[..., None]) * its_cov + outer
 
 
 def _merge_cost(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> Tensor:
