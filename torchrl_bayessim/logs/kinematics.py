@@ -7,7 +7,7 @@ checks hold through impacts. Thresholds are multiples of robust scales of the sa
 
 from __future__ import annotations
 
-__all__ = ["check_channels", "lattice_step", "motions"]
+__all__ = ["RATIOS", "check_channels", "lattice_step", "motions", "over", "white_noise"]
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 _CLEAR = 30.0  # times the noise that a motion must be for what it says to count
 _LIKE = 0.7  # correlation with a velocity that jumps within a step, as at a joint's limit
 _WRONG = 4.0  # times as fast: no sensor's error, but another unit, whatever it is
-_RATIOS = {  # change of position by integrated velocity: what that means
+RATIOS = {  # change of position by integrated velocity: what that means
     57.3: "positions are in degrees, velocities in radians",
     1 / 57.3: "velocities are in degrees, positions in radians",
     2 * np.pi / 60: "velocities are in revolutions per minute",
@@ -130,7 +130,7 @@ def _agreement(motion: Motion, velocity: Array, time: Array) -> Iterator[Found]:
     steps, change = np.diff(time), np.diff(motion.position)
     travelled = steps * (velocity[1:] + velocity[:-1]) / 2
     span = int(np.clip(np.ceil(0.1 / np.median(steps)), 3, max(3, len(time) // 8)))
-    moved, integrated = _over(change, span), _over(travelled, span)
+    moved, integrated = over(change, span), over(travelled, span)
     if min(moved.std(), integrated.std()) > 0:
         correlation = float(np.corrcoef(moved, integrated)[0, 1])
         ratio = moved.std() / integrated.std()
@@ -138,7 +138,7 @@ def _agreement(motion: Motion, velocity: Array, time: Array) -> Iterator[Found]:
             yield "velocity_sign", everywhere, "its velocity has the opposite sign", "error"
             return
         if correlation > 0.9 and not 0.85 < ratio < 1.18:
-            meaning = [text for r, text in _RATIOS.items() if abs(np.log(ratio / r)) < 0.15]
+            meaning = [text for r, text in RATIOS.items() if abs(np.log(ratio / r)) < 0.15]
             text = meaning[0] if meaning else f"changes {ratio:.3g} times as fast as its velocity"
             wrong = meaning or not 1 / _WRONG < ratio < _WRONG
             yield "velocity_scale", everywhere, text, "error" if wrong else "warning"
@@ -157,10 +157,10 @@ def _mismatch(
     """Say how a velocity is another quantity, where motion and velocity are far above noise."""
     (moved, integrated), span = over, len(steps) - len(over[0]) + 1
     dt = np.median(steps)
-    told = moved.std() / (_noise(motion.position) + lattice_step(motion.position) + 1e-12)
+    told = moved.std() / (white_noise(motion.position) + lattice_step(motion.position) + 1e-12)
     if told > _CLEAR and np.ptp(velocity) == 0:
         return "moves while its velocity never changes"
-    noise = dt * (_noise(velocity) * span**0.5 + lattice_step(velocity) * span) + 1e-12
+    noise = dt * (white_noise(velocity) * span**0.5 + lattice_step(velocity) * span) + 1e-12
     if min(told, integrated.std() / noise) < _CLEAR:
         return None
     usual = np.abs(moved) < 6 * np.median(np.abs(moved)) + 1e-12  # without jumps
@@ -174,9 +174,9 @@ def _mismatch(
     return "does not move as its velocity says: are columns swapped?"
 
 
-def _noise(values: Array) -> float:
+def white_noise(values: Array) -> float:
     """Return the standard deviation of white noise on values, from their third differences."""
-    return float(1.4826 * np.median(np.abs(np.diff(values, 3))) / np.sqrt(20))
+    return float(1.4826 * np.median(np.abs(np.diff(values, 3, axis=0))) / np.sqrt(20))
 
 
 def _likeness(first: Array, second: Array, rows: NDArray[np.bool_]) -> float:
@@ -192,8 +192,9 @@ def _likeness(first: Array, second: Array, rows: NDArray[np.bool_]) -> float:
     return max(found)
 
 
-def _over(values: Array, span: int) -> Array:
-    total = np.concatenate([[0.0], np.cumsum(values)])
+def over(values: Array, span: int) -> Array:
+    """Return sums over ``span`` steps in succession, shape ``(T - span + 1, *)``."""
+    total = np.concatenate([np.zeros_like(values[:1]), np.cumsum(values, axis=0)])
     return total[span:] - total[:-span]
 
 
@@ -202,12 +203,10 @@ def _lag(change: Array, travelled: Array, span: int, steps: Array) -> Iterator[F
     reach = min(10, len(change) // 10)
     lags = np.arange(-reach, reach + 1)
     inner = slice(reach, len(change) - reach)
-    errors = np.array(
-        [
-            np.median(np.abs(_over((change[inner] - np.roll(travelled, -lag)[inner]), span)))
-            for lag in lags
-        ]
-    )
+    errors = [
+        np.median(np.abs(over(change[inner] - np.roll(travelled, -lag)[inner], span)))
+        for lag in lags
+    ]
     best = int(np.argmin(errors))
     if lags[best] != 0 and errors[best] < 0.4 * errors[reach]:
         late = lags[best] * np.median(steps)

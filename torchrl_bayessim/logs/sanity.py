@@ -22,6 +22,7 @@ from .kinematics import check_channels, lattice_step, motions
 from .log import Log
 from .record import Record, plausible, usable_rows
 from .resampling import resample
+from .rotations import check_rotations
 from .system import System
 from .timestamps import check_time
 from .units import check_offsets
@@ -61,6 +62,7 @@ def check(records: Sequence[Record], system: System, *, horizon: int = 10) -> li
     for record in records:
         found += check_time(record, system.control_dt)
         found += check_channels(record, system)
+        found += check_rotations(record, system)
         found += _missing(record, system)
     found += _copies(records)
     found += check_offsets(records, system)
