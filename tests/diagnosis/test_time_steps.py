@@ -2,7 +2,6 @@
 
 import mujoco
 import numpy as np
-import pytest
 import torch
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
@@ -12,10 +11,8 @@ from torchrl_bayessim.diagnosis.segments import cut
 from torchrl_bayessim.diagnosis.time_steps import with_fewest_steps
 from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.envs.task import Task
-from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.system import System
-from torchrl_bayessim.physics.mujoco import MujocoPhysics
 
 ARM = """
 <mujoco><option timestep="{dt}" integrator="{integrator}"/><worldbody>
@@ -26,10 +23,9 @@ ARM = """
 NOISE = np.array([0.001, 0.02])
 
 
-def system(integrator, *, dt=0.0025, frame_skip=8, prior=None):
+def system(integrator, *, dt=0.0025, frame_skip=8):
     model = mujoco.MjModel.from_xml_string(ARM.format(dt=dt, integrator=integrator))
-    physics = None if prior is None else MujocoPhysics(*prior.names)
-    return System(task=Task(model=model, frame_skip=frame_skip), physics=physics, prior=prior)
+    return System(task=Task(model=model, frame_skip=frame_skip))
 
 
 def runs(integrator="RK4", *, count=4, friction=0.0):
@@ -62,8 +58,8 @@ def runs(integrator="RK4", *, count=4, friction=0.0):
 def fewest(robot, names=("coulomb_friction", "action_lag")):
     units = units_of([effect(name) for name in names], robot.robot)
     segments = cut(runs(), 20, history=8, most=8)
-    z = np.zeros(1 + (0 if robot.prior is None else len(robot.prior.names)))
-    return with_fewest_steps(Predictor(robot, threads=1), segments, units, z=z, noise=NOISE)
+    predictor = Predictor(robot, threads=1)
+    return with_fewest_steps(predictor, segments, units, z=np.zeros(1), noise=NOISE)
 
 
 def test_a_smooth_arm_needs_few_steps_of_an_integrator_of_high_order():
@@ -75,17 +71,8 @@ def test_a_smooth_arm_needs_few_steps_of_an_integrator_of_high_order():
     np.testing.assert_allclose(few, own, atol=0.02 * NOISE.min())
 
 
-@pytest.mark.parametrize(
-    "robot",
-    [
-        pytest.param(system("Euler"), id="first order"),
-        pytest.param(
-            system("RK4", prior=BoxPrior({"opt.timestep": (0.002, 0.003)})), id="uncertain step"
-        ),
-    ],
-)
-def test_others_keep_the_steps_of_their_model(robot):
-    assert fewest(robot).substeps == 8
+def test_others_keep_the_steps_of_their_model():
+    assert fewest(system("Euler")).substeps == 8
 
 
 def test_what_is_found_is_fitted_with_the_steps_of_the_model():
