@@ -194,8 +194,26 @@ def test_unknown_effects_are_refused():
         (lambda log: replace(log, qpos=log.qpos * torch.nan), "NaN or infinity in qpos of run0"),
         (lambda log: replace(log, ctrl=log.ctrl / 0.0), "NaN or infinity in ctrl of run0"),
         (lambda log: replace(log, time=log.time.flip(0)), "whose time increases, got 'run0"),
+        (
+            lambda log: replace(log, time=2 * log.time),
+            r"rows 0\.01 s apart, .* got '0\.02 to 0\.02",
+        ),
+        (lambda log: replace(log, time=log.time[:5]), r"qpos of shape \(5, 1\), got '\(30, 1\)"),
+        (lambda log: replace(log, qpos=log.qpos.repeat(1, 3)), r"qpos of shape \(30, 1\), got"),
+        (lambda log: replace(log, qvel=log.qvel[:9]), r"qvel of shape \(30, 1\), got '\(9, 1\) in"),
+        (
+            lambda log: replace(log, ctrl=log.ctrl[:, :0]),
+            r"ctrl of shape \(30, 1\), got '\(30, 0\)",
+        ),
+        (lambda log: replace(log, measured=log.measured[:1]), r"measured of shape \(2,\), got"),
+        (
+            lambda log: replace(log, qpos=log.qpos.numpy()),
+            "a tensor as qpos of run0, got 'ndarray'",
+        ),
+        (lambda log: replace(log, time=None), "a tensor as time of run0, got 'NoneType'"),
+        (lambda log: replace(log, ctrl=log.ctrl.int()), "ctrl of run0 in floating-point numbers"),
     ],
 )
-def test_logs_made_by_hand_are_finite_and_in_order(spoil, said):
-    with pytest.raises(ValueError, match=said):
+def test_logs_made_by_hand_are_of_this_robot_finite_and_in_order(spoil, said):
+    with pytest.raises((ValueError, TypeError), match=said):
         diagnose(system(), None, [spoil(log) for log in logs(count=2, steps=30)])

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import torch
 from threadpoolctl import threadpool_limits
 
 from ..counts import check_count
@@ -37,6 +38,7 @@ from .selection import select
 from .shapes import SHAPED, shaped
 
 _ALPHA = 0.01
+_JITTER = 0.05  # of the control step; times since 1970 are rounded
 
 
 def diagnose(
@@ -71,8 +73,9 @@ def diagnose(
 
     Raises:
         TypeError: The simulator, the prior, a log or an effect is of another kind.
-        ValueError: There are no logs, none is long enough, one is not finite or not in order, an
-            effect is asked for twice, or there is no such mode.
+        ValueError: There are no logs, none is long enough, one is of another robot or control
+            step, not finite or not in order, an effect is asked for twice, or there is no such
+            mode.
         KeyError: An effect is not in the catalogue.
     """
     begun = time.perf_counter()
@@ -83,10 +86,10 @@ def diagnose(
     check_kind("a whole number as the seed", seed, int)
     check_count("seed", seed, least=0)
     check_kind("a sequence of logs", logs, list, tuple)
-    for log in logs:
-        _check_log(log)
     check_kind("a sequence of findings", findings, list, tuple)
     system = _system(simulator, prior)
+    for log in logs:
+        _check_log(log, system)
     chosen = _effects(system, effects, logs)
     every = units_of(chosen, system.robot)
     told = None if mode is None else MODES[mode]()
@@ -132,16 +135,40 @@ def diagnose(
         )
 
 
-def _check_log(log: Log) -> None:
+def _check_log(log: Log, system: System) -> None:
     check_kind("a Log, as read_logs gives", log, Log)
+    hint = "read_logs(source, system) with this system"
+    check_kind(f"a tensor as time of {log.name}", log.time, torch.Tensor, hint=hint)
+    model, length = system.task.model, log.time.numel()
+    sizes = {
+        "time": (length,),
+        "qpos": (length, model.nq),
+        "qvel": (length, model.nv),
+        "ctrl": (length, model.nu),
+        "velocity_gain": (model.nv,),
+        "measured": (2 * model.nv,),
+    }
+    for name, size in sizes.items():
+        value = getattr(log, name)
+        check_kind(f"a tensor as {name} of {log.name}", value, torch.Tensor, hint=hint)
+        if value.shape != size:
+            expected = f"logs of this simulator, {name} of shape {size}"
+            raise ValueError(message(expected, f"{tuple(value.shape)} in {log.name}", hint=hint))
+        if name != "measured" and not value.is_floating_point():
+            expected = f"{name} of {log.name} in floating-point numbers"
+            raise TypeError(message(expected, str(value.dtype), hint=hint))
     for name in ("time", "qpos", "qvel", "ctrl"):
         if not bool(getattr(log, name).isfinite().all()):
-            hint = "read_logs, which leaves such rows out"
             got = f"NaN or infinity in {name} of {log.name}"
             raise ValueError(message("logs of finite numbers", got, hint=hint))
-    if not bool((log.time.diff() > 0).all()):
+    steps = log.time.diff()
+    if not bool((steps > 0).all()):
         got = f"{log.name}, where it does not"
         raise ValueError(message("logs whose time increases", got))
+    if not bool(((steps / system.control_dt - 1).abs() < _JITTER).all()):
+        expected = f"logs with rows {system.control_dt:g} s apart, the control step"
+        got = f"{float(steps.min()):g} to {float(steps.max()):g} s in {log.name}"
+        raise ValueError(message(expected, got, hint=hint))
 
 
 def _asks_for_holds(units: Sequence[Unit]) -> bool:
