@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "torchrl_bayessim")
 SEEDS = 2**32
+THREADS = 1024
 FREE = ("progress", "debug", "logger")  # settings that a resumed run may change
 
 
@@ -199,8 +200,8 @@ def parse(settings_type: type[S], arguments: list[str]) -> S:
     settings: Any = OmegaConf.to_object(given)
     if not 0 <= settings.seed < SEEDS:
         raise ValueError(message(f"a seed from 0 to {SEEDS - 1}", settings.seed))
-    if settings.threads < 1:
-        raise ValueError(message("threads to be positive", settings.threads))
+    if not 1 <= settings.threads <= THREADS:
+        raise ValueError(message(f"threads from 1 to {THREADS}", settings.threads))
     keys = [argument.partition("=")[0] for argument in arguments]
     return resumed(settings, keys) if getattr(settings, "resume", "") else settings
 

@@ -199,7 +199,7 @@ def refused(tmp_path, monkeypatch, capsys):
         ("rounds=2.5", "expected values of the settings' types"),
         ("rounds", "expected arguments of the form key=value, got 'rounds'"),
         ("rounds=0", "expected rounds to be positive, got 0"),
-        ("threads=0", "expected threads to be positive, got 0"),
+        ("threads=0", "expected threads from 1 to 1024, got 0"),
         ("updates=-1", "expected updates not to be negative, got -1"),
         ("resume=nowhere", "expected the folder of a run to resume, got 'nowhere'"),
     ],

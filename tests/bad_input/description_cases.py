@@ -140,6 +140,7 @@ def values():
         "noise of no channel": ("{q: 0.001", "{x: 0.001", "a channel in noise, got 'x'"),
         "negative noise": ("{q: 0.001", "{q: -0.001", "standard deviation of q"),
         "noise of NaN": ("{q: 0.001", "{q: nan", "standard deviation of q"),
+        "huge noise": ("{q: 0.001", "{q: 1e300", "standard deviation of q"),
         "infinite noise": ("{q: 0.001", "{q: inf", "standard deviation of q"),
         "noise in words": ("{q: 0.001", "{q: small", "a number under 'q'"),
         "noise as a number": ("{q: 0.001, qd: 0.02}", "0.001", "a mapping"),
@@ -219,6 +220,7 @@ def arguments():
     given = {
         "seed=x": "seed", "horizon=1.5": "horizon", "horizon=-3": "a horizon of 1 or more",
         "horizon=" + "9" * 400: "a horizon of at most",
+        "threads=0": "threads from 1 to 1024", "threads=" + "9" * 12: "threads from 1 to 1024",
         "seed=-1": "seed", "seed=" + "9" * 30: "seed",
         "progress=perhaps": "progress", "debug=perhaps": "debug",
         "out=robot.yaml": "robot.yaml", "out=robot.yaml/deep": "robot.yaml",

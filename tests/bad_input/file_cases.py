@@ -118,6 +118,7 @@ def parquets():
         "lists": ([[1.0, 2.0]] * len(words), "numbers in Parquet in run2.parquet"),
         "maps": ([{"x": 1.0}] * len(words), "numbers in Parquet in run2.parquet"),
         "bytes": ([b"\x00\xff"] * len(words), "numbers in Parquet in run2.parquet"),
+        "dates": (np.array([0] * len(words), "datetime64[ns]"), "Try: seconds, as numbers"),
         "truths": ([True] * len(words), "numbers in column 'q' of run2.parquet, got 'booleans'"),
     }
     for name, (value, said) in others.items():

@@ -232,6 +232,8 @@ def bombs():
             f'<hfield name="h{i}" nrow="10000" ncol="9000" size="1 1 1 1"/>' for i in range(4)
         )
         + "</asset>",
+        "sphere": '<asset><mesh name="m" builtin="supersphere" params="30000 1 1"/></asset>',
+        "ring": '<asset><mesh name="m" builtin="supertorus" params="9000 .5 1 1"/></asset>',
         "readings": '<sensor><user dim="100000000"/></sensor>',
         "activations": '<actuator><general joint="hinge" actdim="100000000"/></actuator>',
         "memory": '<size memory="1000G"/>',

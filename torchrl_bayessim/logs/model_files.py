@@ -22,6 +22,7 @@ _MOST_ELEMENTS, _MOST_KEYS = 10_000, 10_000  # which take MuJoCo 10 s and 1 s to
 _MOST_VALUES = 100_000_000  # of a picture or a height field
 _MOST_SIZE = 1_000_000  # of an attribute of <size>
 _MOST_MEMORY = 4 << 30  # bytes of <size memory>
+_MOST_PARAMS = 200  # of a mesh that MuJoCo makes, in vertices along a side
 _UNITS = {"K": 10, "M": 20, "G": 30, "T": 40, "P": 50, "E": 60}
 
 
@@ -156,6 +157,8 @@ def _check_amount(element: Element, file: str) -> float:
         values += own if pair[0] in element.attrib else 0.0
     for key in ("dim", "actdim"):
         _limit(_numbers(element.get(key, "1")), _MOST_SIZE, key, file)
+    for word in element.get("params", "").split():
+        _limit(_numbers(word), _MOST_PARAMS, "params", file)
     for key, value in element.attrib.items() if element.tag == "size" else ():
         unit = _UNITS.get(value.strip()[-1:].upper(), 0) if key == "memory" else 0
         amount = _numbers(value.strip()[:-1] if unit else value) * 2**unit
@@ -175,7 +178,7 @@ def _check_picture(path: Path) -> None:
 
 def _limit(amount: float, most: float, name: str, file: str) -> None:
     if amount > most:
-        raise ValueError(message(f"{name} of at most {most:g} in {file}", f"{amount:.3g}"))
+        raise ValueError(message(f"{name} of at most {most:g} in {file}", f"{amount:.6g}"))
 
 
 def _numbers(text: str) -> float:

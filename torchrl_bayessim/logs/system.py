@@ -44,6 +44,8 @@ from .columns import Channel, Columns, channels, default_columns, joint_names
 from .description import Description, read_description
 from .simulators import simulator_task
 
+_LARGEST = 1e8  # of noise, as of what is logged
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class System:
@@ -111,7 +113,7 @@ class System:
         for name, value in self.noise.items():
             if name not in known:
                 raise ValueError(message("a channel in noise", name, available=known))
-            check_number(f"standard deviation of {name}", value, least=0.0)
+            check_number(f"standard deviation of {name}", value, least=0.0, most=_LARGEST)
         each_once(() if self.effects is None else self.effects)
 
     @classmethod

@@ -150,6 +150,10 @@ def read_parquet(path: Path, names: list[str]) -> Table:
             column = table[name].combine_chunks()
             if column.type == pyarrow.bool_():
                 raise _no_number(name, path.name)
+            if pyarrow.types.is_temporal(column.type):
+                expected = f"numbers in column {name!r} of {path.name}"
+                hint = "seconds, as numbers"
+                raise ValueError(message(expected, str(column.type), hint=hint))
             column = column.cast(pyarrow.float64())
             columns[name] = np.array(column.fill_null(np.nan).to_numpy(zero_copy_only=False))
     except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:  # names are text
