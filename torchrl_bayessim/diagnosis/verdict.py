@@ -33,6 +33,7 @@ from .validation import NAMED, SHOWN, enough, hardly_shown, share_on_validation
 
 _NEGLIGIBLE = 0.05  # of the noise floor: an excess that no one would chase
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
+_PLAIN = 4.0  # the same, to need no interval: few segments have a wide one, as about impacts
 _CERTAIN = 1e-15  # p-value of a gap that is too small to be seen at a glance
 _MOST = 0.5  # of the joints without measured velocity
 _WORSE = 1.2  # times the error as described, with parameters fitted to other runs
@@ -136,12 +137,11 @@ class _Weighed:
         alpha: float,
     ) -> _Weighed:
         p_value = selection.p_values[0]
-        splits = [float((m**2).mean()) for m in
-                  (selection.nominal.fit.innovations, selection.nominal.validation)]  # fmt: skip
+        others = selection.nominal.fit.innovations, selection.nominal.validation
         certain = p_value < _CERTAIN
-        visible = measured.excess_ci[0] > 0 and (
-            min(measured.refit, *splits) > _UNEXPLAINED or (measured.refit > SHOWN and certain)
-        )
+        least = min(measured.refit, *(float((m**2).mean()) for m in others))
+        shown = least > _UNEXPLAINED or (measured.refit > SHOWN and certain)
+        visible = least > _PLAIN or (measured.excess_ci[0] > 0 and shown)
         validated = share_on_validation(selection) if effects else 0.0
         perhaps_nothing = measured.explained_ci[0] <= 0 and validated < _PARTIAL and not scattered
         unsaid = measured.explained < _PARTIAL or perhaps_nothing
