@@ -925,3 +925,12 @@ def test_killed_at_any_moment_it_resumes_to_the_same_numbers(tmp_path):
     assert done in told
     loop_state = resumed.state_dict()["loop"]
     assert len(loop_state["evidence"]) == done + 2
+
+
+def test_a_robot_says_whether_its_answers_are_recorded():
+    class Own:
+        def rollouts(self, policy, *, episodes, key):
+            raise AssertionError
+
+    with pytest.raises(TypeError, match=r"a robot with recorded=.*Try: recorded = False"):
+        make_loop(robot=Own())

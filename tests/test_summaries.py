@@ -619,3 +619,19 @@ def test_encoder_counts_are_numbers_like_others(summary):
         rows = TensorDict(steps | {"action": action, "mask": mask}, [3, 20])
         found.append(SummaryStatistics(summary)(rows)["summary"])
     torch.testing.assert_close(*found, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("own", "said"),
+    [
+        (lambda state, *_: state.mean((-1, -2)), r"shape \(3, 'L'\) .*, got \(3,\).*unsqueeze"),
+        (lambda *_: torch.tensor(1.0), r"got \(\)"),
+        (lambda state, *_: state, r"got \(3, 5, 4\)"),
+        (lambda state, *_: state[:1].mean(1), r"got \(1, 4\)"),
+        (lambda *_: None, "a tensor from <lambda>, got 'NoneType'"),
+    ],
+)
+def test_a_summary_of_another_shape_is_not_broadcast(own, said):
+    rows = CartPoleEnv(3).rollout(5, break_when_any_done=False)
+    with pytest.raises((ValueError, TypeError), match=said):
+        SummaryStatistics(own)(rows)

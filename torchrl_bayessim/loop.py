@@ -174,6 +174,8 @@ class SimToRealLoop:
         check_kind("a PosteriorRefinement", refinement, PosteriorRefinement)
         for role, owner, method in ("learner", learner, "update"), ("robot", robot, "rollouts"):
             check_function(f"a {role} with {method}()", getattr(owner, method, None))
+        hint = "recorded = False for a robot that answers anew, RecordedLogs(logs) otherwise"
+        check_kind("a robot with recorded=", getattr(robot, "recorded", None), bool, hint=hint)
         policy = getattr(learner, "policy", None)
         check_kind("a learner with a policy, a TensorDictModule", policy, TensorDictModuleBase)
         self.settings: dict[str, Any] = {

@@ -223,9 +223,10 @@ class SummaryStatistics(TensorDictModuleBase):
 
     Raises:
         TypeError: For what is not a function, angles that are no sequence of columns, or keys that
-            are none; in a call, for what is no TensorDict.
+            are none; in a call, for what is no TensorDict, or a function that returns no tensor.
         ValueError: For no functions; in a call, for discrete actions given as indices, no step, no
-            batch size, or observations that are no vectors.
+            batch size, observations that are no vectors, or a function that returns no summary of
+            shape ``(*, L)``.
         KeyError: In a call, for a missing entry.
 
     Example:
@@ -327,7 +328,7 @@ class SummaryStatistics(TensorDictModuleBase):
         finite = torch.stack([x.isfinite().all(-1) for x in (state, action, following)]).all(0)
         usable = (mask.any(-1) & (finite | ~mask).all(-1)).unsqueeze(-1)
         return {
-            i: torch.where(usable, function(state, action, state + tau, mask), torch.nan)
+            i: torch.where(usable, _summary(function, state, action, state + tau, mask), torch.nan)
             for i, function in enumerate(self.functions)
             if ordered in (None, _is_ordered(function))
         }
@@ -413,3 +414,15 @@ def _float(values: Tensor) -> Tensor:
 
 def _is_ordered(function: Summary) -> bool:
     return getattr(function, "ordered", False)
+
+
+def _summary(function: Summary, *trajectories: Tensor) -> Tensor:
+    """Return a function's value, which is not broadcast where it has another shape."""
+    value = function(*trajectories)
+    name = getattr(function, "__name__", type(function).__name__)
+    check_kind(f"a tensor from {name}", value, Tensor)
+    batch = trajectories[0].shape[:-2]
+    if value.ndim != len(batch) + 1 or value.shape[:-1] != batch:
+        expected = f"a summary of shape {(*batch, 'L')} from {name}, one for each trajectory"
+        raise ValueError(message(expected, tuple(value.shape), hint="unsqueeze(-1) of one number"))
+    return value
