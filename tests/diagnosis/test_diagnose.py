@@ -217,3 +217,11 @@ def test_unknown_effects_are_refused():
 def test_logs_made_by_hand_are_of_this_robot_finite_and_in_order(spoil, said):
     with pytest.raises((ValueError, TypeError), match=said):
         diagnose(system(), None, [spoil(log) for log in logs(count=2, steps=30)])
+
+
+def test_logs_in_which_all_is_zero_say_nothing():
+    still = [
+        replace(log, qpos=0 * log.qpos, qvel=0 * log.qvel, ctrl=0 * log.ctrl)
+        for log in logs(count=4, steps=40)
+    ]
+    assert diagnose(system(), None, still, effects=["action_bias"]).verdict == "not_testable"

@@ -76,8 +76,8 @@ class Whitening:
         their median. They are computed once and kept for all candidates: weights of its own would
         let a strong candidate remove what speaks against it.
         """
-        size = np.sqrt((innovations**2).mean(-1))
-        weight = np.minimum(1.0, 1.5 * np.median(size) / np.maximum(size, 1e-12))
+        size = np.maximum(np.sqrt((innovations**2).mean(-1)), 1e-12)  # 0 where all stands still
+        weight = np.minimum(1.0, 1.5 * np.median(size) / size)
         return Whitening(self.inverse, np.sqrt(weight), self.spread, self.drift, self.curvature)
 
 
