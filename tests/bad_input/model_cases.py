@@ -243,6 +243,11 @@ def bombs():
     }  # fmt: skip
     for name, part in sections.items():
         yield xml(f"of too much: {name}", inside(part), "at most")
+    floor = '<worldbody><geom type="plane" size="1 1 1" pos="0 0 -.4"/>'
+    box = '<body pos="0 0 .5"><freejoint/><geom type="box" size=".3 .3 .3" mass="1"/></body>'
+    for size, boxes, said in (("1K", 0, "enough <size memory>"), ("100K", 6, "room for all")):
+        first = f'<size memory="{size}"/>{floor}{boxes * box}'
+        yield xml(f"of {size} of memory", ARM.replace("<worldbody>", first, 1), said)
     attach = "".join(f'<attach model="m" prefix="p{i}"/>' for i in range(9))
     model = '<mujoco><asset><model name="m" file="{}"/></asset><worldbody>{}</worldbody></mujoco>'
     parts = {f"part{i}_xml": model.format(f"part{i + 1}.xml", attach) for i in range(7)}

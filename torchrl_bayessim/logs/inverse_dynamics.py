@@ -33,6 +33,7 @@ from scipy.ndimage import correlate1d
 
 from .log import Log
 from .record import Record
+from .room import room
 
 Array = NDArray[np.float64]
 Terms = tuple[Array, ...]
@@ -88,13 +89,14 @@ def dynamics(model: mujoco.MjModel, record: Record, log: Log, half: int) -> Dyna
     needed, actuated, bias = (np.zeros((len(log), model.nv)) for _ in range(3))
     free = np.ones(len(log), dtype=bool)
     barred = {int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)}
-    for t in range(len(log)):
-        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[t], qvel[t], ctrl[t]
-        mujoco.mj_forward(model, data)
-        actuated[t], bias[t] = data.qfrc_actuator, data.qfrc_bias
-        free[t] = data.ncon == 0 and not barred & set(data.efc_type.tolist())
-        mujoco.mj_mulM(model, data, needed[t], slope[t])
-        needed[t] += data.qfrc_bias
+    with room("the model"):
+        for t in range(len(log)):
+            data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[t], qvel[t], ctrl[t]
+            mujoco.mj_forward(model, data)
+            actuated[t], bias[t] = data.qfrc_actuator, data.qfrc_bias
+            free[t] = data.ncon == 0 and not barred & set(data.efc_type.tolist())
+            mujoco.mj_mulM(model, data, needed[t], slope[t])
+            needed[t] += data.qfrc_bias
     window = np.ones(2 * half + 1) / (2 * half + 1)
     # an action holds until the next row, so what acts around a row began half a step before
     actuated = correlate1d((actuated + np.roll(actuated, 1, axis=0)) / 2, window, axis=0)

@@ -23,6 +23,7 @@ from ..envs.task import Task
 from ..envs.tasks.catalogue import known_task
 from ..errors import message
 from .model_files import check_model_files, inside
+from .room import room
 
 
 def simulator_task(simulator: str, folder: Path, control_dt: float | None) -> Task:
@@ -103,6 +104,7 @@ def _compiled(folder: Path, name: str) -> mujoco.MjModel:
         raise ValueError(message(f"an MJCF file that compiles in {name}", reason)) from None
     _check_numbers(model, name)
     _check_iterations(model, name)
+    _check_room(model, name)
     return model
 
 
@@ -118,6 +120,17 @@ def _check_numbers(model: mujoco.MjModel, name: str) -> None:
                     got = f"{key} {wrong.flat[0]:g} of the {part}"
                     expected = f"numbers below {_LARGEST:g} in {name}"
                     raise ValueError(message(expected, got))
+
+
+def _check_room(model: mujoco.MjModel, name: str) -> None:
+    """Raise a ValueError if the memory that the model reserves is too little where it begins."""
+    data = mujoco.MjData(model)
+    with room(name):
+        mujoco.mj_forward(model, data)
+    full = mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL
+    if any(data.warning[int(kind)].number for kind in full):
+        expected, hint = f"room for all contacts and constraints of {name}", "more <size memory>"
+        raise ValueError(message(expected, f"{model.narena} bytes", hint=hint))
 
 
 def _check_iterations(model: mujoco.MjModel, name: str) -> None:
