@@ -10,9 +10,10 @@ from __future__ import annotations
 import io
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import chdir, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from tempfile import TemporaryDirectory
 from typing import Literal
 
@@ -25,7 +26,7 @@ from torchrl_bayessim.inference.ensemble import average
 from torchrl_bayessim.inference.fit import fit, select_lengthscale
 from torchrl_bayessim.inference.marginals import marginal_log_prob
 from torchrl_bayessim.inference.physics_posterior import PhysicsPosterior
-from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
+from torchrl_bayessim.inference.posterior import MixtureDensityPosterior, Pooling
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.inference.sequential import sequential
 from torchrl_bayessim.randomness import generator, isolated
@@ -34,7 +35,6 @@ from torchrl_bayessim.sources import draw
 Simulator = Callable[[Tensor], Tensor]
 ACCEPTED = 0.05  # share of the simulations that Rejection ABC accepts
 DRAWS = 200
-NETWORKS = 3  # averaged where trajectories are pooled
 
 
 @dataclass(frozen=True)
@@ -61,78 +61,93 @@ Conditioned = Callable[[Tensor], PhysicsPosterior]
 """Summaries ``(R, L)`` of the real trajectories to the posterior."""
 
 
-def bayessim(
+class Networks:
+    """BayesSim's networks, fitted to the same pairs, and the average of their posteriors.
+
+    What one network got wrong is the same for all trajectories, and their product is too sure of
+    it. Several networks got different things wrong: their average is less sure.
+    """
+
+    def __init__(self, networks: Sequence[MixtureDensityPosterior]) -> None:
+        self.networks, self.prior = networks, networks[0].prior
+
+    def distribution(self, summary: Tensor) -> PhysicsPosterior:
+        """Return one posterior per summary."""
+        members = [network.distribution(summary).mixture for network in self.networks]
+        return PhysicsPosterior(average(members), self.prior)
+
+    def condition(self, summaries: Tensor, *, pooling: Pooling) -> PhysicsPosterior:
+        """Return the posterior given the summaries ``(R, L)`` of R real trajectories."""
+        members = [
+            network.condition(summaries, pooling=pooling, check=False).mixture
+            for network in self.networks
+        ]
+        return PhysicsPosterior(average(members), self.prior)
+
+    def averaged(self, truth: Tensor, summary: Tensor, *, seed: int) -> Answer:
+        """Answer by the posterior of the mean summary."""
+        mean = summary.mean(1)
+        q = self.distribution(mean)
+        test = TensorDict({"theta": truth, "summary": mean}, [len(truth)])
+        place = calibrate(self, test, draws=DRAWS, seed=seed).rank  # pyright: ignore
+        return Answer(marginal_log_prob(q, truth), place, q.log_prob(truth))
+
+    def pooled(self, truth: Tensor, summary: Tensor, *, seed: int) -> Answer:
+        """Answer by the posterior of all trajectories together."""
+        g = generator(seed, "pooled")
+        found = []
+        for own, several in zip(truth, summary, strict=True):
+            q = self.condition(several, pooling="product")
+            place = (q.sample((DRAWS,), generator=g) < own).float().mean(0)
+            found.append((marginal_log_prob(q, own), place, q.log_prob(own)))
+        return Answer(*(torch.stack(part) for part in zip(*found, strict=True)))
+
+
+def papers_bayessim(
     prior: BoxPrior,
     theta: Tensor,
     x: Tensor,
     *,
     features: Literal["fourier", "neural"],
     covariance: Literal["diagonal", "full"],
-    paper: bool,
     seed: int,
 ) -> tuple[Fitted, Conditioned]:
-    """Fit BayesSim's network with the paper's choices or our defaults."""
+    """Fit one network with the paper's choices."""
     size = x.shape[-1]
     pairs = TensorDict({"theta": theta, "summary": x}, [len(theta)])
+    own = MixtureDensityPosterior.paper_mode(prior, size, features=features, seed=seed)
     network = MixtureDensityPosterior(
-        prior, size, features=features, covariance=covariance, seed=seed
+        prior,
+        size,
+        components=own.network.components,
+        covariance=covariance,
+        features=own.network.features,
+        compress=False,
+        seed=seed,
     )
-    if paper:
-        own = MixtureDensityPosterior.paper_mode(prior, size, features=features, seed=seed)
-        network = MixtureDensityPosterior(
-            prior,
-            size,
-            components=own.network.components,
-            covariance=covariance,
-            features=own.network.features,
-            compress=False,
-            seed=seed,
-        )
     if features == "fourier":
         select_lengthscale(network, pairs, factors=(1, 2, 4), epochs=12, progress=False)
     fit(network, pairs, seed=seed, progress=False)
-
-    @torch.no_grad()
-    def answer(truth: Tensor, summary: Tensor) -> Answer:
-        mean = summary.mean(1)
-        q = network.distribution(mean)
-        test = TensorDict({"theta": truth, "summary": mean}, [len(truth)])
-        place = calibrate(network, test, draws=DRAWS, seed=seed).rank
-        return Answer(marginal_log_prob(q, truth), place, q.log_prob(truth))
-
-    return answer, lambda summary: network.condition(summary, pooling="mean")
+    networks = Networks([network])
+    answer = torch.no_grad()(partial(networks.averaged, seed=seed))
+    return answer, partial(networks.condition, pooling="mean")
 
 
-def bayessim_pooled(
-    prior: BoxPrior, theta: Tensor, x: Tensor, *, seed: int
+def bayessim(
+    prior: BoxPrior, theta: Tensor, x: Tensor, *, networks: int, pool: bool, seed: int
 ) -> tuple[Fitted, Conditioned]:
-    """Fit our default networks, which answer by the posterior of all trajectories together.
-
-    The product takes trajectories for independent, but what a network got wrong is the same in all
-    of them. Several networks got different things wrong: their average is less sure.
-    """
+    """Fit networks with our defaults, of which several are averaged."""
     pairs = TensorDict({"theta": theta, "summary": x}, [len(theta)])
-    networks = []
-    for fitted in range(NETWORKS * seed, NETWORKS * (seed + 1)):
-        network = MixtureDensityPosterior(prior, x.shape[-1], seed=fitted)
-        fit(network, pairs, seed=fitted, progress=False)
-        networks.append(network)
-
-    def condition(summary: Tensor) -> PhysicsPosterior:
-        members = [network.condition(summary, check=False).mixture for network in networks]
-        return PhysicsPosterior(average(members), prior)
-
-    @torch.no_grad()
-    def answer(truth: Tensor, summary: Tensor) -> Answer:
-        g = generator(seed, "pooled")
-        found = []
-        for own, several in zip(truth, summary, strict=True):
-            q = condition(several)
-            place = (q.sample((DRAWS,), generator=g) < own).float().mean(0)
-            found.append((marginal_log_prob(q, own), place, q.log_prob(own)))
-        return Answer(*(torch.stack(part) for part in zip(*found, strict=True)))
-
-    return answer, condition
+    fitted = []
+    for own in range(networks * seed, networks * (seed + 1)):
+        network = MixtureDensityPosterior(prior, x.shape[-1], seed=own)
+        fit(network, pairs, seed=own, progress=False)
+        fitted.append(network)
+    together = Networks(fitted)
+    answer = together.pooled if pool else together.averaged
+    return torch.no_grad()(partial(answer, seed=seed)), partial(
+        together.condition, pooling="product"
+    )
 
 
 def rejection_abc(prior: BoxPrior, theta: Tensor, x: Tensor) -> Fitted:
