@@ -141,6 +141,12 @@ class _Alone(NamedTuple):
     law: LossLaw
     costs: list[float]
     spoiled: float
+    segments: int
+
+    @property
+    def calm(self) -> bool:
+        """Whether too few segments hold more than noise for losses to be found in them."""
+        return self.law.scatter < _NOISE and self.spoiled * self.segments < _FEWEST
 
     @classmethod
     def of(cls, data: Mapping[str, _Data]) -> _Alone:
@@ -148,14 +154,14 @@ class _Alone(NamedTuple):
         judged, size = [data[name].without for name in _JUDGED], data["train"].left.shape[1]
         law = likeliest(judged, (0.0,), _SCATTER.tolist(), _SPOILED, size=size)
         told = Told.joined([law.told(one) for one in judged])
-        return cls(law, [law.deviance([one]) for one in judged], _spoiled(told))
+        return cls(law, [law.deviance([one]) for one in judged], _spoiled(told), len(told.spoiled))
 
 
 def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> list[Chance]:
     """Return the losses that explain what is wrong with the segments that have them.
 
     The likeliest first, with those that are nearly as likely; none where whole trajectories or
-    statistics are compared.
+    statistics are compared, or where effects that last leave noise alone.
 
     Args:
         prepared: Logs, noise and nominal fit.
@@ -168,6 +174,8 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
     nominal = _cut(prepared)
     best = {n: _Data.of(one.objective, selection.best.fit.point) for n, one in nominal.items()}
     alone, rival = _Alone.of(nominal), _Alone.of(best)
+    if selection.best.units and rival.calm:
+        return []
     # what the best explanation without chance gains by the same standard
     found, least = _all_found(nominal, some, alone), sum(alone.costs) - sum(rival.costs)
     if selection.best.units:
