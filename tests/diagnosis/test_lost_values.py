@@ -104,6 +104,13 @@ def test_friction_and_samples_that_are_not_renewed_are_both_named():
     assert low <= explained(report) <= high
 
 
+def test_losses_are_not_tried_where_an_effect_that_lasts_leaves_noise_alone(monkeypatch):
+    monkeypatch.setattr("torchrl_bayessim.diagnosis.losses._found", pytest.fail)
+    data = logs(6, push=lambda _, v: -0.15 * np.tanh(v / 0.02))
+    report = diagnose(system(), None, data, effects=SOME)
+    assert [effect.name for effect in report.effects] == ["coulomb_friction"]
+
+
 def test_nothing_is_lost_where_commands_are_late_in_a_way_that_no_effect_has():
     def smeared(u, k):
         return float(np.mean(u[max(k - 5, 0) : k + 1]))
