@@ -7,7 +7,15 @@ checks hold through impacts. Thresholds are multiples of robust scales of the sa
 
 from __future__ import annotations
 
-__all__ = ["RATIOS", "check_channels", "lattice_step", "motions", "over", "white_noise"]
+__all__ = [
+    "check_channels",
+    "lattice_step",
+    "meaning",
+    "motions",
+    "over",
+    "stretch",
+    "white_noise",
+]
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -27,7 +35,7 @@ Array = NDArray[np.float64]
 _CLEAR = 30.0  # times the noise that a motion must be for what it says to count
 _LIKE = 0.7  # correlation with a velocity that jumps within a step, as at a joint's limit
 _WRONG = 4.0  # times as fast: no sensor's error, but another unit, whatever it is
-RATIOS = {  # change of position by integrated velocity: what that means
+_RATIOS = {  # change of position by integrated velocity: what that means
     57.3: "positions are in degrees, velocities in radians",
     1 / 57.3: "velocities are in degrees, positions in radians",
     2 * np.pi / 60: "velocities are in revolutions per minute",
@@ -129,7 +137,7 @@ def _agreement(motion: Motion, velocity: Array, time: Array) -> Iterator[Found]:
     everywhere = np.ones(len(time), dtype=bool)
     steps, change = np.diff(time), np.diff(motion.position)
     travelled = steps * (velocity[1:] + velocity[:-1]) / 2
-    span = int(np.clip(np.ceil(0.1 / np.median(steps)), 3, max(3, len(time) // 8)))
+    span = stretch(steps, len(time))
     moved, integrated = over(change, span), over(travelled, span)
     if min(moved.std(), integrated.std()) > 0:
         correlation = float(np.corrcoef(moved, integrated)[0, 1])
@@ -138,9 +146,9 @@ def _agreement(motion: Motion, velocity: Array, time: Array) -> Iterator[Found]:
             yield "velocity_sign", everywhere, "its velocity has the opposite sign", "error"
             return
         if correlation > 0.9 and not 0.85 < ratio < 1.18:
-            meaning = [text for r, text in RATIOS.items() if abs(np.log(ratio / r)) < 0.15]
-            text = meaning[0] if meaning else f"changes {ratio:.3g} times as fast as its velocity"
-            wrong = meaning or not 1 / _WRONG < ratio < _WRONG
+            known = meaning(ratio)
+            text = known or f"changes {ratio:.3g} times as fast as its velocity"
+            wrong = known or not 1 / _WRONG < ratio < _WRONG
             yield "velocity_scale", everywhere, text, "error" if wrong else "warning"
             return
         if correlation > 0.9:
@@ -190,6 +198,16 @@ def _likeness(first: Array, second: Array, rows: NDArray[np.bool_]) -> float:
         if inner.sum() > 2 and min(pair[0].std(), pair[1].std()) > 0:
             found.append(abs(float(np.corrcoef(*pair)[0, 1])))
     return max(found)
+
+
+def stretch(steps: Array, rows: int) -> int:
+    """Return over how many steps motion and velocity are compared: a tenth of a second, or so."""
+    return int(np.clip(np.ceil(0.1 / np.median(steps)), 3, max(3, rows // 8)))
+
+
+def meaning(ratio: float) -> str:
+    """Return what a ratio of motion to integrated velocity means, nothing if it is no unit's."""
+    return next((text for r, text in _RATIOS.items() if abs(np.log(ratio / r)) < 0.15), "")
 
 
 def over(values: Array, span: int) -> Array:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from .columns import joint_names
 from .finding import Finding
-from .kinematics import RATIOS, over, white_noise
+from .kinematics import meaning, over, stretch, white_noise
 from .record import Record, usable_rows
 from .system import System
 
@@ -62,7 +62,7 @@ def _disagreement(at: Rotation, speed: Array, steps: Array) -> tuple[str, str] |
     travelled = steps[:, None] * (speed[1:] + speed[:-1]) / 2
     gaps = steps > _GAP * np.median(steps)  # in which a body may turn by any number of turns
     change[gaps] = travelled[gaps] = 0.0
-    span = int(np.clip(np.ceil(0.1 / np.median(steps)), 3, max(3, len(steps) // 8)))
+    span = stretch(steps, len(steps))
     turned, integrated = over(change, span), over(travelled, span)
     sizes = float(np.linalg.norm(turned)), float(np.linalg.norm(integrated))
     noises = (
@@ -75,9 +75,9 @@ def _disagreement(at: Rotation, speed: Array, steps: Array) -> tuple[str, str] |
     cosine, ratio = float((turned * integrated).sum() / np.prod(sizes)), sizes[0] / sizes[1]
     if cosine < -_ALIKE:
         return "velocity_sign", "the angular velocity has the opposite sign"
-    meaning = [text for r, text in RATIOS.items() if abs(np.log(ratio / r)) < 0.15]
     if cosine > _ALIKE:
-        return ("velocity_scale", meaning[0]) if meaning else None
+        text = meaning(ratio)
+        return ("velocity_scale", text) if text else None
     reach = min(10, len(turned) // 10)  # of filters, which delay a velocity
     late = (np.roll(integrated, lag, 0)[reach:-reach] for lag in range(-reach, reach + 1))
     inner = turned[reach:-reach]
