@@ -151,9 +151,8 @@ def read_parquet(path: Path, names: list[str]) -> Table:
             if column.type == pyarrow.bool_():
                 raise _no_number(name, path.name)
             if pyarrow.types.is_temporal(column.type):
-                expected = f"numbers in column {name!r} of {path.name}"
                 hint = "seconds, as numbers"
-                raise ValueError(message(expected, str(column.type), hint=hint))
+                raise _no_number(name, path.name, str(column.type), hint=hint)
             column = column.cast(pyarrow.float64())
             columns[name] = np.array(column.fill_null(np.nan).to_numpy(zero_copy_only=False))
     except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:  # names are text
@@ -314,10 +313,15 @@ def _by_joint(key: str, flat: NDArray[Any], model: mujoco.MjModel) -> dict[str, 
     return dict(zip(names, flat.T, strict=True)) if len(names) == flat.shape[1] else {}
 
 
-def _no_number(column: str, file: str) -> ValueError:
-    """Return the error for truth values: nobody knows how much they are in the model's units."""
-    hint = "what was measured or commanded, in the units of the model"
-    return ValueError(message(f"numbers in column {column!r} of {file}", "booleans", hint=hint))
+def _no_number(
+    column: str,
+    file: str,
+    kind: str = "booleans",
+    *,
+    hint: str = "what was measured or commanded, in the units of the model",
+) -> ValueError:
+    """Return the error for values of which nobody knows how much they are in the model's units."""
+    return ValueError(message(f"numbers in column {column!r} of {file}", kind, hint=hint))
 
 
 def _check_count(rows: int, names: list[str], file: str) -> None:
