@@ -173,9 +173,10 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
         return []
     nominal = _cut(prepared)
     best = {n: _Data.of(one.objective, selection.best.fit.point) for n, one in nominal.items()}
-    alone, rival = _Alone.of(nominal), _Alone.of(best)
+    rival = _Alone.of(best)
     if selection.best.units and rival.calm:
         return []
+    alone = _Alone.of(nominal)
     # what the best explanation without chance gains by the same standard
     found, least = _all_found(nominal, some, alone), sum(alone.costs) - sum(rival.costs)
     if selection.best.units:
