@@ -240,7 +240,6 @@ def amortised(
 ) -> dict[str, Callable[[], tuple[Fitted, Any]]]:
     """Return the methods that answer for any summary, by name; the pooling one if asked."""
     made: dict[str, Callable[[], tuple[Fitted, Any]]] = {}
-
     several = len(prior.names) > 1
     if not settings.paper_mode:
         made["BayesSim"] = partial(bayessim, prior, theta, x, networks=2, pool=False, seed=seed)

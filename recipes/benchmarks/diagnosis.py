@@ -20,6 +20,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
+from arm import ARM
 from measuring import options, report
 from tensordict import TensorDict
 
@@ -32,18 +33,6 @@ from torchrl_bayessim.logs.read import read_logs
 from torchrl_bayessim.logs.system import System
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
 
-ARM = """
-<mujoco>
-  <option timestep="0.005"/>
-  <worldbody>
-    <body name="link">
-      <joint name="hinge" axis="0 1 0" damping="0.02"/>
-      <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass=".5"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="motor" joint="hinge"/></actuator>
-</mujoco>
-"""
 LEGS = Path(__file__).parent.parent / "systems" / "unitree_go2_legs" / "system.yaml"
 NOISE = (0.001, 0.02)  # rad or m, and per second
 FRICTION: Mapping[str, tuple[str, Mapping[str, float]]] = {

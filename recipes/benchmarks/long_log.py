@@ -20,6 +20,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
+from arm import ARM
 from measuring import options, report
 from threadpoolctl import threadpool_limits
 
@@ -29,18 +30,6 @@ from torchrl_bayessim.logs.read import read_records
 from torchrl_bayessim.logs.sanity import check, usable_logs
 from torchrl_bayessim.logs.system import System
 
-ARM = """
-<mujoco>
-  <option timestep="0.005"/>
-  <worldbody>
-    <body name="link">
-      <joint name="hinge" axis="0 1 0" damping="0.02"/>
-      <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass=".5"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="motor" joint="hinge"/></actuator>
-</mujoco>
-"""
 PERIOD = 400  # rows
 
 
