@@ -6,6 +6,7 @@ import torch
 from torchrl_bayessim.inference.features import (
     FourierFeatures,
     NeuralFeatures,
+    ResidualFeatures,
     spectral_frequencies,
 )
 from torchrl_bayessim.randomness import generator
@@ -110,11 +111,34 @@ def test_neural_features_have_the_asked_layers_and_train_them_all(width):
     assert all(p.grad.abs().sum() > 0 for p in phi.parameters())
 
 
-def test_neural_features_follow_their_seed_and_no_global_generator():
+@pytest.mark.parametrize("blocks", [1, 3])
+def test_residual_layers_add_to_the_first_and_all_train(blocks):
+    phi = ResidualFeatures(3, width=8, blocks=blocks)
+    x = torch.randn(6, 2, 3, generator=generator(0))
+    features = phi(x)
+    assert features.shape == (6, 2, phi.out_features) == (6, 2, 8)
+    features.square().sum().backward()
+    assert len(list(phi.parameters())) == 2 * (1 + blocks)
+    assert all(p.grad.abs().sum() > 0 for p in phi.parameters())
+    with torch.no_grad():  # SiLU is 0 at 0: blocks without weights leave the first layer
+        for block in phi.blocks:
+            block.weight.zero_()
+            block.bias.zero_()
+        torch.testing.assert_close(phi(x), torch.nn.functional.silu(phi.first(x)))
+
+
+@pytest.mark.parametrize("sizes", [{"width": 0}, {"blocks": 0}, {"dim": 0}])
+def test_residual_features_need_sizes(sizes):
+    with pytest.raises(ValueError, match=f"{next(iter(sizes))} to be positive, got 0"):
+        ResidualFeatures(**{"dim": 3} | sizes)
+
+
+@pytest.mark.parametrize("kind", [NeuralFeatures, ResidualFeatures])
+def test_networks_follow_their_seed_and_no_global_generator(kind):
     state = torch.random.get_rng_state()
     x = torch.ones(1, 3)
-    assert torch.equal(NeuralFeatures(3, seed=4)(x), NeuralFeatures(3, seed=4)(x))
-    assert not torch.equal(NeuralFeatures(3, seed=4)(x), NeuralFeatures(3, seed=5)(x))
+    assert torch.equal(kind(3, seed=4)(x), kind(3, seed=4)(x))
+    assert not torch.equal(kind(3, seed=4)(x), kind(3, seed=5)(x))
     assert torch.equal(torch.random.get_rng_state(), state)
 
 

@@ -174,7 +174,7 @@ def test_parameters_that_are_not_finite_are_not_blamed_on_simulations():
         short_fit(posterior(), data)
 
 
-@pytest.mark.parametrize("options", [{"lr": 0.5, "epochs": 6}, {"epochs": 20, "patience": 2}])
+@pytest.mark.parametrize("options", [{"lr": 0.1, "epochs": 12}, {"epochs": 20, "patience": 2}])
 def test_the_parameters_of_the_best_epoch_are_kept(options):
     net, data = posterior(), linear_gaussian(60)
     report = short_fit(net, data, **{"lr": 0.05, "batch_size": 16} | options)
@@ -190,14 +190,15 @@ def test_the_parameters_of_the_best_epoch_are_kept(options):
 
 
 def test_it_stops_once_patience_is_spent():
-    net, data = posterior(), linear_gaussian(60)
-    report = short_fit(net, data, epochs=60, patience=3, lr=0.05, batch_size=16)
+    prior = GaussianPrior({"a": (0, 1), "b": (5, 2)})  # a box would come in after the patience
+    net, data = posterior(prior), linear_gaussian(60, prior=prior)
+    report = short_fit(net, data, epochs=60, patience=3, lr=0.01, batch_size=16)
     best = report.validation.index(report.best)
     assert report.epochs < 60
     assert report.epochs - best - 1 == 3
 
 
-@pytest.mark.parametrize("features", ["neural", "fourier"])
+@pytest.mark.parametrize("features", ["residual", "neural", "fourier"])
 def test_the_same_seed_gives_the_same_fit(features):
     data = linear_gaussian(40)
     nets = [posterior(features=features) for _ in range(3)]
@@ -290,7 +291,7 @@ def test_select_lengthscale_finds_the_scale_of_the_data():
 
 
 def test_select_lengthscale_needs_fourier_features():
-    with pytest.raises(TypeError, match="a posterior over FourierFeatures, got 'NeuralFeatures'"):
+    with pytest.raises(TypeError, match="a posterior over FourierFeatures, got 'ResidualFeatures'"):
         select_lengthscale(posterior(), linear_gaussian(10))
 
 

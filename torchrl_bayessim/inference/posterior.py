@@ -31,7 +31,7 @@ from torch import Tensor
 from ..counts import check_count
 from ..errors import message
 from ..kinds import check_choice, check_kind, real_numbers
-from .features import Features, FourierFeatures, NeuralFeatures
+from .features import Features, FourierFeatures, NeuralFeatures, ResidualFeatures
 from .misspecification import doubts
 from .mixtures import Mixture
 from .network import Covariance, MixtureDensityNetwork
@@ -41,7 +41,7 @@ from .priors import Prior, check_prior
 from .truncation import POINTS, TruncatedGaussianMixture
 
 Pooling = Literal["product", "mean"]
-MAPS = {"neural": NeuralFeatures, "fourier": FourierFeatures}
+MAPS = {"residual": ResidualFeatures, "neural": NeuralFeatures, "fourier": FourierFeatures}
 TRAINING_POINTS = 16  # for the mass of correlated components while the loss is minimised
 
 
@@ -60,7 +60,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         summary_dim: Size L of the summary statistics.
         components: Number K of mixture components.
         covariance: ``"full"``, or ``"diagonal"`` as in the paper.
-        features: ``"neural"``, ``"fourier"``, or a ``Features`` module.
+        features: ``"residual"``, ``"neural"``, ``"fourier"``, or a ``Features`` module.
         compress: Whether heavy tails of the summaries are compressed.
         in_key: Key of the summaries, shape ``(*, L)``.
         out_key: Key of the parameters, shape ``(*, D)``.
@@ -68,7 +68,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
 
     Attributes:
         seen: Summaries that it was fitted to, up to a thousand; ``None`` before a fit.
-        held_out: Pairs that chose the best epoch of an unweighted fit.
+        held_out: Pairs that chose the best epoch, with their weights if the fit had some.
 
     Raises:
         TypeError: The prior is none of :mod:`.priors`, or a size is no whole number.
@@ -94,7 +94,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         *,
         components: int = 4,
         covariance: Covariance = "full",
-        features: Literal["neural", "fourier"] | Features = "neural",
+        features: Literal["residual", "neural", "fourier"] | Features = "residual",
         compress: bool = True,
         in_key: NestedKey = "summary",
         out_key: NestedKey = "theta",
