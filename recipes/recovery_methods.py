@@ -22,13 +22,14 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_bayessim.inference.calibration import calibrate
-from torchrl_bayessim.inference.ensemble import average
+from torchrl_bayessim.inference.ensemble import fit_apart, fit_together
 from torchrl_bayessim.inference.fit import fit, select_lengthscale
 from torchrl_bayessim.inference.marginals import marginal_log_prob
 from torchrl_bayessim.inference.physics_posterior import PhysicsPosterior
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior, Pooling
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.inference.sequential import sequential
+from torchrl_bayessim.inference.widening import average
 from torchrl_bayessim.randomness import generator, isolated
 from torchrl_bayessim.sources import draw
 
@@ -136,13 +137,11 @@ def papers_bayessim(
 def bayessim(
     prior: BoxPrior, theta: Tensor, x: Tensor, *, networks: int, pool: bool, seed: int
 ) -> tuple[Fitted, Conditioned]:
-    """Fit networks with our defaults, of which several are averaged."""
+    """Fit networks with our defaults, whose answers are averaged, or their products."""
     pairs = TensorDict({"theta": theta, "summary": x}, [len(theta)])
-    fitted = []
-    for own in range(networks * seed, networks * (seed + 1)):
-        network = MixtureDensityPosterior(prior, x.shape[-1], seed=own)
-        fit(network, pairs, seed=own, progress=False)
-        fitted.append(network)
+    seeds = range(networks * seed, networks * (seed + 1))
+    fitted = [MixtureDensityPosterior(prior, x.shape[-1], seed=own) for own in seeds]
+    (fit_apart if pool else fit_together)(fitted, pairs, seeds=seeds, progress=False)
     together = Networks(fitted)
     answer = together.pooled if pool else together.averaged
     return torch.no_grad()(partial(answer, seed=seed)), partial(

@@ -24,15 +24,15 @@ from ..randomness import generator
 from .posterior import TRAINING_POINTS, MixtureDensityPosterior
 from .rows import Rows
 from .truncation import TruncatedGaussianMixture
+from .widening import widen
 
 _WARM_UP = 0.1  # share of the steps in which the learning rate rises
 _FREE = 0.5  # share of the epochs that do without the box
 _CLIP = 10.0  # of the gradient's norm
-_WIDENINGS = (1.0, 1.05, 1.1, 1.15, 1.2, 1.3, 1.4, 1.5, 1.75, 2.0)
 
 
 class _Pairs(NamedTuple):
-    summary: Tensor
+    scaled: Tensor
     z: Tensor
     volume: Tensor
     weight: Tensor
@@ -105,23 +105,8 @@ def descend(
         if truncated and stale >= patience:
             break
     posterior.load_state_dict(best_state)
-    _widen(posterior, held)
+    widen([posterior], validation)
     return losses
-
-
-@torch.no_grad()
-def _widen(posterior: MixtureDensityPosterior, held: _Pairs) -> None:
-    """Widen all deviations by the factor that held-out pairs like best.
-
-    A network is surer of the pairs that it learned from than of others; one number, learned from
-    the others, undoes most of it (temperature scaling, Guo et al., 2017, arXiv:1706.04599).
-    """
-    widening = posterior.network.widening
-    scores = {}
-    for factor in _WIDENINGS:
-        widening.fill_(factor)
-        scores[factor] = _loss(posterior, held, truncated=True).item()
-    widening.fill_(min(scores, key=scores.__getitem__))
 
 
 def _one_cycle(step: int, steps: int) -> float:
@@ -149,13 +134,14 @@ def _prepared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> _Pai
     volume = posterior.prior.standardization.log_abs_det_jacobian(z, theta)
     weight = pairs.get("weight", None)
     weight = z.new_ones(len(z)) if weight is None else weight.reshape(len(z)).double()
-    return _Pairs(pairs.get(posterior.summary_key), z, volume, weight)
+    scaled = posterior.network.scaled(pairs.get(posterior.summary_key))
+    return _Pairs(scaled, z, volume, weight)
 
 
 def _loss(posterior: MixtureDensityPosterior, pairs: _Pairs, *, truncated: bool) -> Tensor:
     """Return the weighted negative log-density in nats, as `PosteriorLoss` does."""
     network = posterior.network
-    logits, loc, scale_tril = network(pairs.summary)
+    logits, loc, scale_tril = network.mixture(pairs.scaled)
     mixture = TruncatedGaussianMixture(
         logits,
         loc,

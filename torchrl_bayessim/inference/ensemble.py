@@ -1,13 +1,13 @@
 """A posterior from pairs: networks fitted to them, conditioned on the real data, and averaged.
 
-One network is sure of what it cannot know where pairs are few. Several, fitted on other splits of
-the same pairs, disagree there, and their average is less sure (deep ensembles, Lakshminarayanan,
+One network is sure of what it cannot know where pairs are few. Several, fitted to the same pairs in
+another order, disagree there, and their average is less sure (deep ensembles, Lakshminarayanan,
 Pritzel & Blundell, 2017, arXiv:1612.01474).
 """
 
 from __future__ import annotations
 
-__all__ = ["PosteriorMaker", "average", "learn", "pairs_of", "real_summaries"]
+__all__ = ["PosteriorMaker", "fit_apart", "fit_together", "learn", "pairs_of", "real_summaries"]
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ from .fit import FitReport, fit, usable_pairs
 from .physics_posterior import PhysicsPosterior
 from .posterior import MixtureDensityPosterior
 from .priors import Prior
-from .truncation import TruncatedGaussianMixture
+from .widening import average, widen
 
 PosteriorMaker = Callable[[Prior, int], MixtureDensityPosterior]
 
@@ -48,13 +48,60 @@ def learn(
         fit_options: Passed to :func:`.fit.fit`; a seed there takes the place of those above.
     """
     pairs, dropped = usable_pairs(pairs)  # once, not once for each network
-    observed = observed.to(pairs["summary"])
-    reports, members = [], []
-    for seed in seeds:
-        network = make_posterior(prior, pairs["summary"].shape[-1])
-        reports.append(fit(network, pairs, **{"seed": seed, **fit_options}))
-        members.append(network.condition(observed, check=False).mixture)
+    observed = torch.atleast_2d(observed.to(pairs["summary"]))
+    networks = [make_posterior(prior, pairs["summary"].shape[-1]) for _ in seeds]
+    # of an average of products, over several trajectories, held-out pairs say nothing: there each
+    # network must be as wide as it needs by itself
+    fitted = fit_together if len(observed) == 1 else fit_apart
+    reports = fitted(networks, pairs, seeds=seeds, **fit_options)
+    members = [network.condition(observed, check=False).mixture for network in networks]
     return PhysicsPosterior(average(members), prior), replace(reports[0], dropped=dropped)
+
+
+def fit_apart(
+    networks: Sequence[MixtureDensityPosterior],
+    pairs: TensorDictBase,
+    *,
+    seeds: Sequence[int],
+    **options: Any,
+) -> list[FitReport]:
+    """Fit each network on a split of its own, one seed each; what is left goes to `.fit.fit`."""
+    return [
+        fit(network, pairs, **{"seed": seed, **options})
+        for network, seed in zip(networks, seeds, strict=True)
+    ]
+
+
+def fit_together(
+    networks: Sequence[MixtureDensityPosterior],
+    pairs: TensorDictBase,
+    *,
+    seeds: Sequence[int],
+    **options: Any,
+) -> list[FitReport]:
+    """Fit networks whose answers are averaged: one split, and as wide as their average needs.
+
+    Args:
+        networks: Changed in place.
+        pairs: ``{"theta", "summary"[, "weight"]}``, batch size ``[N]``.
+        seeds: Of the minibatches, one for each network; the split is the first's.
+        options: Passed to :func:`.fit.fit`; a seed there takes the place of those above.
+
+    Example:
+        >>> from torchrl_bayessim.inference.priors import BoxPrior
+        >>> prior = BoxPrior({"a": (0.0, 1.0)})
+        >>> theta = torch.linspace(0, 1, 200)[:, None]
+        >>> networks = [MixtureDensityPosterior(prior, 1, seed=seed) for seed in (0, 1)]
+        >>> reports = fit_together(networks, pairs_of(theta, theta), seeds=(0, 1), epochs=3,
+        ...                        progress=False)
+        >>> torch.equal(*(network.network.widening for network in networks))
+        True
+    """
+    reports = fit_apart(networks, pairs, seeds=seeds, **{"split_seed": seeds[0], **options})
+    held_out = networks[0].held_out
+    if len(networks) > 1 and held_out is not None:
+        widen(networks, held_out)
+    return reports
 
 
 def pairs_of(theta: Tensor, summary: Tensor) -> TensorDict:
@@ -106,16 +153,3 @@ def real_summaries(observed: Any) -> Tensor:
             )
         )
     return observed
-
-
-def average(members: Sequence[TruncatedGaussianMixture]) -> TruncatedGaussianMixture:
-    """Return the mixture of mixtures, all with the same weight."""
-    if len(members) == 1:
-        return members[0]
-    return TruncatedGaussianMixture(
-        torch.cat([member.logits for member in members], -1),
-        torch.cat([member.loc for member in members], -2),
-        torch.cat([member.scale_tril for member in members], -3),
-        members[0].box,
-        diagonal=members[0].diagonal,
-    )

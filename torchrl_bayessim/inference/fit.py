@@ -118,6 +118,7 @@ def fit(
     patience: int = 25,
     rescale: bool = True,
     seed: int = 0,
+    split_seed: int | None = None,
     progress: bool = True,
 ) -> FitReport:
     """Maximise the posterior's log-density over pairs ``{"theta", "summary"[, "weight"]}``.
@@ -148,6 +149,7 @@ def fit(
         patience: Epochs without improvement after which it stops: see :func:`.descent.descend`.
         rescale: Whether to set the input scaling from these pairs (yes on the first fit).
         seed: Of the split and of the minibatches.
+        split_seed: Of the split, if not ``seed``: networks that share it hold out the same pairs.
         progress: Whether to show a progress bar.
 
     Raises:
@@ -167,20 +169,21 @@ def fit(
     check_number("weight_decay", weight_decay, least=0.0)
     for name, value in {"epochs": epochs, "batch_size": batch_size, "patience": patience}.items():
         check_count(name, value)
+    split_seed = seed if split_seed is None else split_seed
     data = _in_floats(data, posterior.theta_key, posterior.summary_key)
     keys = (posterior.theta_key, posterior.summary_key)
     data = data.select(*keys, "weight", strict=False)
     rows = _usable_rows(data, *keys)
     dropped = len(data) - len(rows)
     rows = _check_pairs(posterior, Rows(data, rows))
-    order = rows[torch.randperm(len(rows), generator=generator(seed, "split"))]
+    order = rows[torch.randperm(len(rows), generator=generator(split_seed, "split"))]
     held_out = min(max(1, round(validation_fraction * len(rows))), len(rows) - 2, _HELD_OUT)
     validation, train = data[order[:held_out]], Rows(data, order[held_out:])
     if rescale:
         summaries = (part.get(posterior.summary_key) for part in train.parts())
         _warn_of(posterior.network.standardize_inputs(summaries), Rows(data, rows), keys[1])
     posterior.seen = train[:_SEEN].get(posterior.summary_key)
-    posterior.held_out = None if "weight" in data.keys() else validation  # noqa: SIM118
+    posterior.held_out = validation
     trace = descend(
         posterior,
         train if mapped(data) else train[:],

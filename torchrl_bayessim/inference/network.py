@@ -112,9 +112,13 @@ class MixtureDensityNetwork(nn.Module):
 
     def forward(self, summary: Tensor) -> Mixture:
         """Return the mixture for summaries ``(*, L)``."""
-        raw = self.head(self.features(self.scaled(summary)))
+        return self.mixture(self.scaled(summary))
+
+    def mixture(self, scaled: Tensor) -> Mixture:
+        """Return the mixture for what :meth:`scaled` made of summaries, ``(*, L)``."""
+        raw = self.head(self.features(scaled))
         logits, loc, diagonal, lower = raw.split(self.sizes, -1)
-        shape = (*summary.shape[:-1], self.components, self.parameters_)
+        shape = (*scaled.shape[:-1], self.components, self.parameters_)
         loc = self.reach * torch.tanh(loc.reshape(shape) / self.reach)
         deviation = self.widening * melu(diagonal.reshape(shape)).sqrt()
         deviation = WIDEST * torch.tanh(deviation / WIDEST)

@@ -76,7 +76,7 @@ def trust(
         network: After :func:`.fit.fit`.
         observed: Real summaries, shape ``(n, L)`` or ``(L,)``.
         held_out: Pairs that it was not trained on; by default those that chose its best epoch,
-            which flatter it a little.
+            which flatter it a little; none if the fit had weights.
         simulate: Parameters ``(N, D)`` to summaries ``(N, L)``, for the posterior predictive check.
         simulations: Of that check.
         seed: Same seed, same report.
@@ -108,7 +108,7 @@ def trust(
     rows = torch.atleast_2d(real_summaries(observed))
     posterior = network.condition(rows, check=False)
     found = doubts(network.seen, rows, posterior)
-    pairs = network.held_out if held_out is None else held_out
+    pairs = _unweighted(network.held_out) if held_out is None else held_out
     calibration = None
     if pairs is not None and len(pairs) >= _FEWEST:
         calibration = calibrate(network, pairs, seed=seed)
@@ -124,3 +124,8 @@ def trust(
                 "out as the real summary: they do not reproduce the data."
             )
     return Trust(posterior, tuple(found), identifiability(posterior), calibration, predictive)
+
+
+def _unweighted(pairs: TensorDictBase | None) -> TensorDictBase | None:
+    """Return pairs that are all worth the same, as the ranks of a calibration need them."""
+    return None if pairs is None or "weight" in pairs.keys() else pairs  # noqa: SIM118
