@@ -41,8 +41,8 @@ class PosteriorRefinement:
         prior: What is believed before any data.
         simulations: Pairs per refinement, where it simulates itself. Fewer than 50 are too few to
             tell whether the real summary lies apart, and nothing is said of it then.
-        networks: Networks fitted each time, on other splits of the pairs; the posterior is their
-            average, which is less sure where they disagree.
+        networks: Networks fitted each time; the posterior is their average, which is less sure
+            where they disagree: see :mod:`.ensemble`.
         make_posterior: ``(prior, summary size)`` to a fresh network; a default one if omitted.
         margin: Widening of the box around the last posterior, as a share of it: see
             :func:`.proposals.focus`.

@@ -88,8 +88,8 @@ def sequential(
             of all rounds; ``"analytic"`` on the last round's, and if it has to refuse a
             division, warns and goes on with the posterior before.
         prior_share: Share of the draws from the prior that is kept in every proposal.
-        networks: Networks fitted each round, on other splits of the pairs; the posterior is their
-            average, which is less sure where they disagree.
+        networks: Networks fitted each round; the posterior is their average, which is less sure
+            where they disagree: see :mod:`.ensemble`.
         make_posterior: Summary size to a fresh network; a default one if omitted.
         seed: Same seed, same rounds (if the simulator is deterministic).
         **fit_options: Passed to :func:`.fit.fit`.
