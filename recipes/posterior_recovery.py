@@ -81,7 +81,10 @@ def job(settings: Recovery, out: Path) -> dict[str, Any]:
             "pendulum,mountain_car" if settings.problem == "all" else settings.problem
         )
         settings.npe = False
-    names = chosen(settings)
+    names = chosen(settings.problem)
+    if settings.npe and find_spec("sbi") is None:
+        settings.npe = False
+        print("sbi is not installed (extra sbi): its NPE and SMC-ABC are left out")
     seeds = range(settings.seed, settings.seed + settings.seeds)
     todo = [(name, seed) for seed in seeds for name in names]
     folder = out / "parts"
@@ -106,18 +109,15 @@ def job(settings: Recovery, out: Path) -> dict[str, Any]:
     return result
 
 
-def chosen(settings: Recovery) -> list[str]:
-    """Return the problems to run; says which cannot be."""
-    names = list(PROBLEMS) if settings.problem == "all" else settings.problem.split(",")
+def chosen(problem: str) -> list[str]:
+    """Return the problems to run, of ``"all"`` or names with commas; says which cannot be."""
+    names = list(PROBLEMS) if problem == "all" else problem.split(",")
     for name in names:
         if name not in PROBLEMS:
             raise ValueError(message("a problem", name, available=[*PROBLEMS, "all"]))
     missing = [n for n in names if PROBLEMS[n].needs and find_spec(PROBLEMS[n].needs) is None]
     for name in missing:
         print(f"{name} is left out: {PROBLEMS[name].needs} is not installed (extra pybullet)")
-    if settings.npe and find_spec("sbi") is None:
-        settings.npe = False
-        print("sbi is not installed (extra sbi): its NPE and SMC-ABC are left out")
     return [name for name in names if name not in missing]
 
 

@@ -9,9 +9,11 @@ from typing import Any
 
 import torch
 from recovery_problems import PROBLEMS
+from scipy.stats import binom, kstest
 from torch import Tensor
 
 BY_PRODUCT = "BayesSim pooled"
+OURS = "BayesSim"
 
 
 def rows(parts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
@@ -35,6 +37,7 @@ def rows(parts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
                     "nats_over_prior": statistics.fmean(nats) if nats else None,
                     "coverage_50": covered(place, 0.5),
                     "coverage_90": covered(place, 0.9),
+                    "sbc_p": uniform(place),
                     "truths": len(place),
                     "seconds_simulate": statistics.fmean(p["seconds_simulate"] for p in own),
                     "seconds_fit": None if None in fits else statistics.fmean(fits),
@@ -48,6 +51,14 @@ def rows(parts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
 def covered(place: Tensor, level: float) -> float | None:
     """Return the share of truths in central intervals of this level."""
     return ((place - 0.5).abs() <= level / 2).float().mean().item() if len(place) else None
+
+
+def uniform(place: Tensor) -> float | None:
+    """Return how likely places as uneven are if they are uniform, as those of a right posterior.
+
+    Simulation-based calibration (Talts et al., 2018, arXiv:1804.06788), by Kolmogorov and Smirnov.
+    """
+    return float(kstest(place.numpy(), "uniform").pvalue) if len(place) else None
 
 
 def joint(parts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
@@ -89,6 +100,7 @@ def table(result: dict[str, Any], names: list[str]) -> str:
         lines += ["", *(f"- {text}" for text in result["said"].get(name, [])), ""]
     if result["paper_mode"]:
         lines += [*against_the_paper(result["rows"]), ""]
+    lines += [*calibration(result["rows"]), ""]
     lines += ["All parameters together, nats over the prior averaged over other truths:", ""]
     lines += ["| problem | method | nats | fit [s] |", "|---|---|---|---|"]
     lines += [
@@ -111,6 +123,35 @@ def against_the_paper(rows: list[dict[str, Any]]) -> list[str]:
             f"| {best['method']} | {pooled[0]:.2f} |"
         ]
     return ["Log-density at the truth, mean over seeds:", "", *lines]
+
+
+def calibration(rows: list[dict[str, Any]]) -> list[str]:
+    """Return how often the intervals of our networks hold the truth, and what ranks say."""
+    own = [row for row in rows if row["method"].startswith(OURS) and row["truths"]]
+    if not own:
+        return []
+    text = {
+        count: ", ".join(
+            f"{level:.0%}: {low / count:.1%} to {high / count:.1%}"
+            for level in (0.5, 0.9)
+            for low, high in [binom.interval(0.95, count, level)]
+        )
+        for count in dict.fromkeys(row["truths"] for row in own)
+    }
+    lines = [
+        "How many of the truths our intervals hold, and the chance of ranks as uneven if they were "
+        "uniform. A right posterior's are 19 times of 20 in these bands, of "
+        + "; of ".join(f"{count} truths {band}" for count, band in text.items())
+        + ".",
+        "",
+        "| problem, parameter | method | 50 % | 90 % | p of the ranks | truths |",
+        "|---|---|---|---|---|---|",
+    ]
+    return lines + [
+        f"| {row['problem']}, {row['parameter']} | {row['method']} | {row['coverage_50']:.1%} "
+        f"| {row['coverage_90']:.1%} | {row['sbc_p']:.2g} | {row['truths']} |"
+        for row in own
+    ]
 
 
 def cell(row: dict[str, Any]) -> str:

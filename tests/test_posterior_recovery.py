@@ -10,6 +10,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+import torch
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "posterior_recovery.py"
 
@@ -33,6 +34,21 @@ def finished(tmp_path_factory):
     status, out, err = run("short=true", "problem=pendulum", "out=run", folder=folder)
     assert status == 0, err
     return folder, out
+
+
+def rows_of(folder):
+    return json.loads((folder / "run/result.json").read_text())["rows"]
+
+
+def test_ranks_that_are_not_uniform_are_told(monkeypatch):
+    monkeypatch.syspath_prepend(RECIPE.parent)
+    from recovery_table import uniform
+
+    even = (torch.arange(300) + 0.5) / 300
+    assert uniform(even) > 0.99
+    assert uniform(0.25 + even / 2) < 1e-6  # too unsure
+    assert uniform(even.round()) < 1e-6  # too sure
+    assert uniform(even[:0]) is None
 
 
 def test_rows_have_what_others_read(finished):
@@ -66,6 +82,9 @@ def test_table_and_picture_are_there(finished):
     table = (folder / "run/table.md").read_text()
     assert "| paper, best | 3.20 | |" in table
     assert "These data say much about dt" in table
+    (own,) = (row for row in rows_of(folder) if row["method"] == "BayesSim")
+    assert f"| {own['coverage_90']:.1%} | {own['sbc_p']:.2g} | 32 |" in table
+    assert "of 32 truths 50%: 31.2% to 68.8%, 90%: 78.1% to 100.0%." in table  # binomial
     assert (folder / "run/pendulum.png").stat().st_size > 5000
 
 
