@@ -1,0 +1,67 @@
+"""Rounds against one round from the command line, as users run it."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+RECIPE = Path(__file__).parent.parent / "recipes" / "sequential_refinement.py"
+
+
+def run(*arguments, folder):
+    done = subprocess.run(
+        [sys.executable, str(RECIPE), "progress=false", *arguments],
+        cwd=folder,
+        env=os.environ | {"PYTHONWARNINGS": "ignore"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_both_ways_tell_more_with_more_simulations_and_parts_are_kept(tmp_path):
+    status, out, err = run("short=true", "out=run", folder=tmp_path)
+    assert status == 0, err
+    result = json.loads((tmp_path / "run/result.json").read_text())
+    assert json.loads(out.splitlines()[-1].removeprefix("RESULT ")) == result
+    found = result["problems"]["pendulum"]
+    assert found["simulations"] == [100, 200]
+    for rows in found["nats"].values():
+        assert len(rows) == 2
+        assert all(len(row) == 2 for row in rows)
+    assert found["mean"]["one round"][-1]["mean"] > 0.5
+    assert found["mean"]["sequential"][-1]["mean"] > found["mean"]["sequential"][0]["mean"] - 0.5
+    gained = [b[-1] - a[-1] for a, b in zip(*found["nats"].values(), strict=True)]
+    assert found["gain"]["values"] == pytest.approx(gained)
+    assert (tmp_path / "run/nats_pendulum.png").stat().st_size > 5000
+    assert "| simulations | one round | sequential |" in (tmp_path / "run/table.md").read_text()
+    assert len(list((tmp_path / "run/parts").iterdir())) == 3
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ("truths=1", "expected truths=2 or more, for an interval, got 1"),
+        ("rounds=100", "at least 16 simulations in each .*, got 'rounds=100 simulations=1000'"),
+        ("problem=pendulumm", "expected a problem, got 'pendulumm'"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(given, expected, tmp_path):
+    status, _, err = run(given, folder=tmp_path)
+    assert status == 2
+    assert re.search(expected, err), err
+
+
+def test_the_fewest_simulations_are_those_of_the_mean_over_robots(monkeypatch):
+    monkeypatch.syspath_prepend(RECIPE.parent)
+    from sequential_refinement import fewest
+
+    once = [[0.0, 1.0, 2.0], [0.0, 1.0, 4.0]]
+    assert fewest([1, 2, 3], {"one round": once, "sequential": [[1, 4, 9], [1, 3, 9]]}) == 2
+    assert fewest([1, 2, 3], {"one round": once, "sequential": [[0, 2, 2], [0, 3, 3]]}) is None
