@@ -1,5 +1,6 @@
 """Simulations on Ray: a cluster of two processors, begun here, whose workers are killed."""
 
+import gc
 import json
 import os
 import signal
@@ -54,6 +55,7 @@ def cluster():
     ray.init(**options, logging_level="error")
     yield ray
     ray.shutdown()
+    gc.collect()  # handles of its processes, which warn when they go
 
 
 @pytest.fixture(scope="module")

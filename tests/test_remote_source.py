@@ -1,3 +1,4 @@
+import gc
 import sys
 from functools import partial
 
@@ -98,6 +99,8 @@ def test_a_pushed_source_reaches_workers_of_ray():
 
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
     assert_push_arrives(partial(RayCollector, sync=True))
+    ray.shutdown()
+    gc.collect()  # handles of its processes, which warn when they go
 
 
 def test_which_worker_runs_an_environment_does_not_matter():
