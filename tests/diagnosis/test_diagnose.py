@@ -1,5 +1,6 @@
 """Small robots whose cause is known; the generator steps MuJoCo itself."""
 
+import json
 from dataclasses import replace
 
 import mujoco
@@ -136,6 +137,12 @@ def test_the_frequency_of_a_disturbance_is_found():
     assert report.effects[0].strength == pytest.approx(0.3, rel=0.15)
     effect = next(iter(report.strengths))
     assert effect.frequency == pytest.approx(1.7, abs=0.1)
+    assert f"N m, {effect.frequency:.3g} Hz)" in report.summary
+    told = json.loads(report.as_json())
+    assert told["effects"][0]["form"] == {"frequency": effect.frequency, "phase": effect.phase}
+    (named,) = (c for c in told["candidates"] if c["status"] == "named")
+    assert named["form"] == told["effects"][0]["form"]
+    assert {k: v for k, v in told["candidates"][-1].items() if k == "form"} == {"form": {}}
 
 
 def test_a_late_command_is_named_with_what_it_cannot_be_told_from():

@@ -300,6 +300,7 @@ def _effects(
                 p_value=p_value,
                 share_of_gap=max(0.0, credit.get(name, 0.0) * measured.explained),
                 strengths={u.where: s for u, s in zip(units, strengths, strict=True)},
+                form=units[int(np.argmax(np.abs(strengths)))].effect.form,
             )
         )
     return tuple(sorted(found, key=lambda f: -f.share_of_gap))

@@ -58,6 +58,7 @@ def candidates(
                 explained_fraction=float(np.clip(ratio * growth[unit] / excess, 0.0, 1.0)),
                 explained_by_parameters=swallowed[unit],
                 minimal_detectable_strength=unit.actual(least) if np.isfinite(least) else None,
+                form=unit.effect.form,
                 status=_status(
                     unit,
                     used,

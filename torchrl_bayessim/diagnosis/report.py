@@ -43,6 +43,8 @@ class Finding:
         p_value: Of the test that nothing was missing, when it was found.
         share_of_gap: Share of the explainable error that it removes, over all orders of adding.
         strengths: By target.
+        form: What its law has beside the strength, by the names of the effect's options, such as
+            the ``frequency`` of a ``periodic_disturbance`` in Hz; of the strongest target's.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Finding:
     p_value: float
     share_of_gap: float
     strengths: Mapping[str, float]
+    form: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +75,7 @@ class Candidate:
         minimal_detectable_strength: What would have been seen with probability 0.8; ``None`` where
             not even the largest plausible strength.
         status: What became of it.
+        form: What its law has beside the strength, as in :class:`Finding`.
     """
 
     name: str
@@ -85,6 +89,7 @@ class Candidate:
     explained_by_parameters: float
     minimal_detectable_strength: float | None
     status: Literal["named", "rejected", "ruled_out", "not_excited", "confounded"]
+    form: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)

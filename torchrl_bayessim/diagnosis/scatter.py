@@ -158,6 +158,7 @@ class Scatter:
                 p_value=float(np.exp(-first.gain / 2)),
                 share_of_gap=max(measured.explained - others, 0.0),
                 strengths={first.unit.where: first.strength},
+                form=first.unit.effect.form,
             ),
         )
 
@@ -188,6 +189,7 @@ class Scatter:
             explained_by_parameters=0.0,
             minimal_detectable_strength=least if np.isfinite(least) else None,
             status=self._status(unit, least),
+            form=unit.effect.form,
         )
 
     def _known(self, unit: Unit) -> tuple[float, float, float]:

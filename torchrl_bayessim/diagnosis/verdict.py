@@ -40,6 +40,7 @@ _WORSE = 1.2  # times the error as described, with parameters fitted to other ru
 _PLACE = 0.2  # of the error, to say that it sits there
 _NOISE_AGAIN = 2.0  # mean squared innovation: as much again as the noise
 _ALL, _PARTIAL = 0.98, 0.4
+_FORMS = {"frequency": ", {:.3g} Hz", "number": ", {:.3g} per turn"}  # what readers know it by
 
 
 def conclude(
@@ -269,7 +270,8 @@ def _described(effect: Finding) -> str:
     half = (effect.ci95[1] - effect.ci95[0]) / 2
     place = "at all" if effect.where == "all" else f"at {effect.where}"
     name = effect.name.replace("_", " ")
-    return f"{name} {place} ({effect.strength:.3g} ± {half:.2g} {effect.unit})"
+    law = "".join(text.format(effect.form[k]) for k, text in _FORMS.items() if k in effect.form)
+    return f"{name} {place} ({effect.strength:.3g} ± {half:.2g} {effect.unit}{law})"
 
 
 def _ruled_out(candidates: Sequence[Candidate]) -> str:

@@ -39,7 +39,7 @@ __all__ = [
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from types import SimpleNamespace
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 from torch import Tensor
 
@@ -92,6 +92,11 @@ class Effect(ABC):
     def __repr__(self) -> str:
         options = ", ".join(f"{name}={value!r}" for name, value in vars(self).items())
         return f"{type(self).__name__}({options})"
+
+    @property
+    def form(self) -> dict[str, Any]:
+        """What the law has beside its strength, by the names of the options."""
+        return dict(vars(self))
 
     def on(self, robot: Robot) -> Effect:
         """Return the law that this effect is on this robot: itself, unless actuators matter."""
