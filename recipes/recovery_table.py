@@ -13,7 +13,7 @@ from scipy.stats import binom, kstest
 from torch import Tensor
 
 BY_PRODUCT = "BayesSim pooled"
-OURS = "BayesSim"
+DEFAULTS = "BayesSim"
 
 
 def rows(parts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
@@ -126,8 +126,12 @@ def against_the_paper(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def calibration(rows: list[dict[str, Any]]) -> list[str]:
-    """Return how often the intervals of our networks hold the truth, and what ranks say."""
-    own = [row for row in rows if row["method"].startswith(OURS) and row["truths"]]
+    """Return how often the intervals of our default networks hold the truth, and what ranks say."""
+    own = [
+        row
+        for row in rows
+        if row["truths"] and (row["method"] == DEFAULTS or row["method"].startswith(BY_PRODUCT))
+    ]
     if not own:
         return []
     text = {
