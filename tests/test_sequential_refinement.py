@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -25,7 +26,7 @@ def run(*arguments, folder):
     return done.returncode, done.stdout, done.stderr
 
 
-def test_both_ways_tell_more_with_more_simulations_and_parts_are_kept(tmp_path):
+def test_both_ways_tell_more_with_more_simulations_and_parts_are_kept(tmp_path, same_numbers):
     status, out, err = run("short=true", "out=run", folder=tmp_path)
     assert status == 0, err
     result = json.loads((tmp_path / "run/result.json").read_text())
@@ -41,7 +42,13 @@ def test_both_ways_tell_more_with_more_simulations_and_parts_are_kept(tmp_path):
     assert found["gain"]["values"] == pytest.approx(gained)
     assert (tmp_path / "run/nats_pendulum.png").stat().st_size > 5000
     assert "| simulations | one round | sequential |" in (tmp_path / "run/table.md").read_text()
-    assert len(list((tmp_path / "run/parts").iterdir())) == 3
+    parts = sorted((tmp_path / "run/parts").iterdir())
+    assert len(parts) == 3
+    shutil.copytree(tmp_path / "run", tmp_path / "again")
+    (tmp_path / "again/parts" / parts[0].name).unlink()  # which is run again, to the same numbers
+    status, _, err = run("short=true", "out=again", folder=tmp_path)
+    assert status == 0, err
+    same_numbers(tmp_path / "run", tmp_path / "again")
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,7 @@ SETTINGS = {
     "sim2real_seeds": ("short=true", "seeds=2"),
     "sim2real_ddpg_her": ("short=true",),
     "posterior_recovery": ("short=true",),
+    "sequential_refinement": ("short=true",),
     "robustness": ("short=true", "seeds=2"),
     "close_the_loop": ("short=true", "seeds=2"),
     "withheld_effects": ("robots=arm", "tiers=T0=1,T1=1", "seed=5"),
