@@ -37,6 +37,12 @@ def test_a_network_that_is_too_sure_gets_the_factor_that_it_lacks(factor):
     assert widen([network], held_out()) == factor == pytest.approx(network.network.widening.item())
 
 
+def test_the_pairs_stay_as_they_were():
+    pairs = held_out(20)
+    widen([sure(DEVIATION), sure(DEVIATION)], pairs)
+    assert set(pairs.keys(include_nested=True)) == {"theta", "summary"}
+
+
 def test_a_network_alone_is_never_made_surer():
     assert widen([sure(2 * DEVIATION)], held_out()) == 1.0
 

@@ -40,7 +40,7 @@ def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase)
     scores = {}
     for factor in _WIDER if alone else _NARROWER + _WIDER:
         _set(networks, factor)
-        members = [network.get_dist(held_out).mixture for network in networks]
+        members = [network.get_dist(held_out.copy()).mixture for network in networks]
         scores[factor] = _mean(average(members).log_prob(z), weight)
     best = max(scores, key=scores.__getitem__)
     return _set(networks, best if alone else _RESERVE * best)
