@@ -259,3 +259,17 @@ def test_progress_bars_are_shown_as_the_options_say_or_else_as_asked(capsys):
         made.refine(noisy(BOX), torch.zeros(4), key=(0,), progress=asked)
         shown.append("epoch" in capsys.readouterr().err)
     assert shown == [False, True, False]
+
+
+def members(mixture, count):
+    """Return each network's share of an average: its means."""
+    return mixture.loc.chunk(count, -2)
+
+
+@pytest.mark.parametrize("maker", [None, small])
+def test_networks_disagree_even_where_one_batch_holds_all_pairs(maker):
+    """So few that no order of minibatches makes a difference."""
+    made = refinement(networks=2, simulations=60, make_posterior=maker)
+    made.refine(noisy(BOX), noisy(BOX, 7)(torch.tensor([[0.4, 2.0]]))[0], key=(0,))
+    one, two = members(made.posterior.mixture, 2)
+    assert (one - two).abs().max() > 0.01

@@ -6,8 +6,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_bayessim.inference.ensemble import fit_together
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import GaussianPrior
+from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
 from torchrl_bayessim.inference.widening import average, widen
 from torchrl_bayessim.randomness import generator
 
@@ -63,6 +65,44 @@ def test_pairs_count_by_their_weight():
     assert widen([sure(DEVIATION)], pairs) == 2.0
     pairs["weight"] = 1 - pairs["weight"]
     assert widen([sure(DEVIATION)], pairs) == 1.0
+
+
+def fitted_together(count, **options):
+    networks = [MixtureDensityPosterior(PRIOR, 1, components=1, seed=seed) for seed in (0, 1)]
+    theta = PRIOR.sample((count,), generator=generator("theta"))
+    noise = 0.3 * torch.randn(count, 1, generator=generator("noise"))
+    pairs = TensorDict({"theta": theta, "summary": theta + noise}, [count])
+    fit_together(networks, pairs, **{"epochs": 3, "progress": False} | options)
+    return networks
+
+
+def test_a_few_held_out_pairs_do_not_choose_how_wide_an_average_is():
+    for network in fitted_together(490, seeds=(0, 1)):
+        assert network.network.widening >= 1
+    one, two = fitted_together(500, seeds=(0, 1), epochs=20)
+    assert one.network.widening == two.network.widening
+    assert one.network.widening.item() not in {1.0, 1.1, 1.2}  # but with the reserve
+
+
+def test_networks_together_hold_out_the_same_pairs_and_a_given_seed_chooses_them():
+    one, two = fitted_together(100, seeds=(0, 1))
+    assert torch.equal(one.held_out["theta"], two.held_out["theta"])
+    seeded, other = (fitted_together(100, seeds=seeds, seed=5)[0] for seeds in ((0, 1), (2, 3)))
+    assert torch.equal(seeded.held_out["theta"], other.held_out["theta"])
+    assert not torch.equal(one.held_out["theta"], seeded.held_out["theta"])
+
+
+def test_an_average_of_other_covariances_is_not_diagonal():
+    box = (-torch.ones(2), torch.ones(2))
+    tril = torch.tensor([[[0.5, 0.0], [0.4, 0.3]]])
+    parts = [
+        TruncatedGaussianMixture(torch.zeros(1), torch.zeros(1, 2), scale, box, diagonal=diagonal)
+        for scale, diagonal in ((0.5 * torch.eye(2)[None], True), (tril, False))
+    ]
+    z = torch.tensor([[0.2, -0.3]])
+    expected = (parts[0].log_prob(z).exp() + parts[1].log_prob(z).exp()) / 2
+    for order in (parts, parts[::-1]):
+        torch.testing.assert_close(average(order).log_prob(z).exp(), expected)
 
 
 def test_the_average_has_the_mean_density():

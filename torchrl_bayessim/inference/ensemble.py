@@ -1,7 +1,7 @@
 """A posterior from pairs: networks fitted to them, conditioned on the real data, and averaged.
 
-One network is sure of what it cannot know where pairs are few. Several, fitted to the same pairs in
-another order, disagree there, and their average is less sure (deep ensembles, Lakshminarayanan,
+One network is sure of what it cannot know where pairs are few. Several, with other initial weights
+and minibatches, disagree there, and their average is less sure (deep ensembles, Lakshminarayanan,
 Pritzel & Blundell, 2017, arXiv:1612.01474).
 """
 
@@ -11,6 +11,7 @@ __all__ = ["PosteriorMaker", "fit_apart", "fit_together", "learn", "pairs_of", "
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import torch
@@ -24,6 +25,8 @@ from .physics_posterior import PhysicsPosterior
 from .posterior import MixtureDensityPosterior
 from .priors import Prior
 from .widening import average, widen
+
+_FEWEST = 50  # held-out pairs that choose how wide an average is
 
 PosteriorMaker = Callable[[Prior, int], MixtureDensityPosterior]
 
@@ -49,13 +52,30 @@ def learn(
     """
     pairs, dropped = usable_pairs(pairs)  # once, not once for each network
     observed = torch.atleast_2d(observed.to(pairs["summary"]))
-    networks = [make_posterior(prior, pairs["summary"].shape[-1]) for _ in seeds]
-    # of an average of products, over several trajectories, held-out pairs say nothing: there each
-    # network must be as wide as it needs by itself
-    fitted = fit_together if len(observed) == 1 else fit_apart
+    networks = [_made(make_posterior, prior, pairs["summary"].shape[-1], seed) for seed in seeds]
+    # of an average of products, over several trajectories, held-out pairs say nothing; and networks
+    # that begin alike need other pairs to disagree: each is as wide then as it needs by itself
+    together = len(observed) == 1 and not _alike(networks)
+    fitted = fit_together if together else fit_apart
     reports = fitted(networks, pairs, seeds=seeds, **fit_options)
     members = [network.condition(observed, check=False).mixture for network in networks]
     return PhysicsPosterior(average(members), prior), replace(reports[0], dropped=dropped)
+
+
+def _made(
+    make_posterior: PosteriorMaker, prior: Prior, size: int, seed: int
+) -> MixtureDensityPosterior:
+    """Return a fresh network; of the default ones each begins with weights of its own."""
+    if make_posterior is MixtureDensityPosterior:
+        return MixtureDensityPosterior(prior, size, seed=seed)
+    return make_posterior(prior, size)
+
+
+def _alike(networks: Sequence[MixtureDensityPosterior]) -> bool:
+    """Return whether some begin with the same weights."""
+    first = [torch.nn.utils.parameters_to_vector(n.parameters()).detach() for n in networks]
+    pairs = combinations(first, 2)
+    return any(a.shape == b.shape and torch.equal(a, b) for a, b in pairs)
 
 
 def fit_apart(
@@ -87,19 +107,23 @@ def fit_together(
         seeds: Of the minibatches, one for each network; the split is the first's.
         options: Passed to :func:`.fit.fit`; a seed there takes the place of those above.
 
+    With fewer than 50 pairs held out each network stays as wide as it needs by itself: the few
+    would choose the factor by chance.
+
     Example:
         >>> from torchrl_bayessim.inference.priors import BoxPrior
         >>> prior = BoxPrior({"a": (0.0, 1.0)})
-        >>> theta = torch.linspace(0, 1, 200)[:, None]
+        >>> theta = torch.linspace(0, 1, 600)[:, None]
         >>> networks = [MixtureDensityPosterior(prior, 1, seed=seed) for seed in (0, 1)]
         >>> reports = fit_together(networks, pairs_of(theta, theta), seeds=(0, 1), epochs=3,
         ...                        progress=False)
         >>> torch.equal(*(network.network.widening for network in networks))
         True
     """
-    reports = fit_apart(networks, pairs, seeds=seeds, **{"split_seed": seeds[0], **options})
+    shared = {"split_seed": options.get("seed", seeds[0])}
+    reports = fit_apart(networks, pairs, seeds=seeds, **shared | options)
     held_out = networks[0].held_out
-    if len(networks) > 1 and held_out is not None:
+    if len(networks) > 1 and held_out is not None and len(held_out) >= _FEWEST:
         widen(networks, held_out)
     return reports
 

@@ -149,8 +149,7 @@ class ResidualFeatures(Features):
         h_0 = \sigma(W_0 x + b_0), \qquad h_{i} = h_{i-1} + \sigma(W_i h_{i-1} + b_i),
 
     with :math:`\sigma` the SiLU (He, Zhang, Ren & Sun, 2016, "Deep residual learning for image
-    recognition", arXiv:1512.03385). On the problems of the paper's table, with 1,000 pairs, it
-    learns 0 to 0.5 nats more than :class:`NeuralFeatures` of two layers, in the same time.
+    recognition", arXiv:1512.03385).
 
     Args:
         dim: Size L of the input.

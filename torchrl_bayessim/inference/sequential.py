@@ -132,11 +132,9 @@ def sequential(
             pairs,
             prior,
             observed,
-            make_posterior=lambda prior, size: (
-                MixtureDensityPosterior(prior, size, seed=seed)
-                if make_posterior is None
-                else make_posterior(size)
-            ),
+            make_posterior=MixtureDensityPosterior
+            if make_posterior is None
+            else lambda _, size: make_posterior(size),
             seeds=[seed, *(seed_from(seed, "network", i) for i in range(1, networks))],
             fit_options=fit_options,
         )

@@ -77,6 +77,6 @@ def average(members: Sequence[TruncatedGaussianMixture]) -> TruncatedGaussianMix
         torch.cat([member.loc for member in members], -2),
         torch.cat([member.scale_tril for member in members], -3),
         members[0].box,
-        diagonal=members[0].diagonal,
+        diagonal=all(member.diagonal for member in members),
         points=members[0].points,
     )
