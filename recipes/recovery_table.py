@@ -9,8 +9,10 @@ from typing import Any
 
 import torch
 from recovery_problems import PROBLEMS
-from scipy.stats import binom, kstest
+from scipy.stats import kstest
 from torch import Tensor
+
+from torchrl_bayessim.inference.calibration import coverage_band
 
 BY_PRODUCT = "BayesSim pooled"
 DEFAULTS = "BayesSim"
@@ -136,9 +138,8 @@ def calibration(rows: list[dict[str, Any]]) -> list[str]:
         return []
     text = {
         count: ", ".join(
-            f"{level:.0%}: {low / count:.1%} to {high / count:.1%}"
+            "{:.0%}: {:.1%} to {:.1%}".format(level, *coverage_band(count, level))
             for level in (0.5, 0.9)
-            for low, high in [binom.interval(0.95, count, level)]
         )
         for count in dict.fromkeys(row["truths"] for row in own)
     }

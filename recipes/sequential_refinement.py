@@ -13,6 +13,7 @@ over the prior's against the number of simulations; finished parts are kept in `
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,9 +74,9 @@ def compared(settings: Refinement, name: str, folder: Path, pool: Executor) -> d
     """Return the nats of both ways after each round's worth of simulations, per robot."""
     size = settings.simulations // settings.rounds
     kind = f"{name}_{settings.rounds}x{size}_{settings.truths}_{settings.seed}"
-    once = pool.submit(part, folder / f"{kind}_once.json", "all_at_once", settings, name)
+    once = pool.submit(part, folder / f"{kind}_once.json", all_at_once, settings, name)
     jobs = [
-        pool.submit(part, folder / f"{kind}_{i}.json", "in_rounds", settings, name, i)
+        pool.submit(part, folder / f"{kind}_{i}.json", in_rounds, settings, name, i)
         for i in range(settings.truths)
     ]
     bar = tqdm(jobs, desc=name, unit="robot", disable=not settings.progress)
@@ -101,10 +102,9 @@ def fewest(counts: list[int], nats: dict[str, list[list[float]]]) -> int | None:
     return counts[int(enough[0])] if len(enough) else None
 
 
-def part(file: Path, way: str, *arguments: Any) -> dict[str, Any]:
+def part(file: Path, way: Callable[..., list[Any]], *arguments: Any) -> dict[str, Any]:
     """Return what one job gave, from its file if it is there."""
-    ways = {"all_at_once": all_at_once, "in_rounds": in_rounds}
-    return recipe.kept(file, lambda: {"nats": ways[way](*arguments)})
+    return recipe.kept(file, lambda: {"nats": way(*arguments)})
 
 
 def robots(settings: Refinement, name: str) -> tuple[torch.Tensor, torch.Tensor]:

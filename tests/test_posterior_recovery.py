@@ -1,31 +1,20 @@
 """The table of recovered parameters from its command line, as users run it."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
+from functools import partial
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from command_line import run_recipe
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "posterior_recovery.py"
 
 
-def run(*arguments, folder):
-    done = subprocess.run(
-        [sys.executable, str(RECIPE), "progress=false", *arguments],
-        cwd=folder,
-        env=os.environ | {"PYTHONWARNINGS": "ignore"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    return done.returncode, done.stdout, done.stderr
+run = partial(run_recipe, RECIPE)
 
 
 @pytest.fixture(scope="module")

@@ -1,29 +1,18 @@
 """Rounds against one round from the command line, as users run it."""
 
 import json
-import os
 import re
 import shutil
-import subprocess
-import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
+from command_line import run_recipe
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "sequential_refinement.py"
 
 
-def run(*arguments, folder):
-    done = subprocess.run(
-        [sys.executable, str(RECIPE), "progress=false", *arguments],
-        cwd=folder,
-        env=os.environ | {"PYTHONWARNINGS": "ignore"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    return done.returncode, done.stdout, done.stderr
+run = partial(run_recipe, RECIPE)
 
 
 def test_both_ways_tell_more_with_more_simulations_and_parts_are_kept(tmp_path, same_numbers):

@@ -40,10 +40,8 @@ _WORSE = 1.2  # times the error as described, with parameters fitted to other ru
 _PLACE = 0.2  # of the error, to say that it sits there
 _NOISE_AGAIN = 2.0  # mean squared innovation: as much again as the noise
 _ALL, _PARTIAL = 0.98, 0.4
-_FORMS = {
-    "frequency": ", {:.3g} Hz",
-    "number": ", {:.3g} per turn or 2π m",
-}  # what readers know it by
+# what readers know a law by, beside its strength
+_FORMS = {"frequency": ", {:.3g} Hz", "number": ", {:.3g} per turn or 2π m"}
 
 
 def conclude(

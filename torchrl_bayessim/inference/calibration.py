@@ -17,7 +17,7 @@ A posterior that is too sure has ranks at both ends and truths outside its regio
 
 from __future__ import annotations
 
-__all__ = ["Calibration", "calibrate", "calibrate_draws"]
+__all__ = ["Calibration", "calibrate", "calibrate_draws", "coverage_band"]
 
 from dataclasses import dataclass
 from typing import Any
@@ -62,8 +62,7 @@ class Calibration:
 
     def band(self, level: float, *, confidence: float = 0.95) -> tuple[float, float]:
         """Return the interval in which the coverage of a right posterior falls so often."""
-        low, high = binom.interval(confidence, len(self.rank), level)
-        return float(low) / len(self.rank), float(high) / len(self.rank)
+        return coverage_band(len(self.rank), level, confidence=confidence)
 
     def p_values(self) -> dict[str, float]:
         """Return a Kolmogorov-Smirnov p-value per share: small ones say that it is not uniform."""
@@ -89,6 +88,22 @@ class Calibration:
             f"hold {inner['joint']:.0%} and {outer['joint']:.0%} ({worst[0]}: p = {worst[1]:.1g}). "
             "Try more simulations, or the average of several networks."
         ]
+
+
+def coverage_band(count: int, level: float, *, confidence: float = 0.95) -> tuple[float, float]:
+    """Return the interval in which the coverage of a right posterior falls so often.
+
+    Args:
+        count: Number of truths.
+        level: Of the regions that hold them.
+        confidence: How often.
+
+    Example:
+        >>> coverage_band(320, 0.5)
+        (0.44375, 0.55625)
+    """
+    low, high = binom.interval(confidence, count, level)
+    return float(low) / count, float(high) / count
 
 
 def calibrate_draws(

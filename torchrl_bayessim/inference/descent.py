@@ -24,6 +24,7 @@ from ..randomness import generator
 from .posterior import TRAINING_POINTS, MixtureDensityPosterior
 from .rows import Rows
 from .truncation import TruncatedGaussianMixture
+from .weights import weighted_mean, weights_of
 from .widening import widen
 
 _WARM_UP = 0.1  # share of the steps in which the learning rate rises
@@ -132,10 +133,8 @@ def _prepared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> _Pai
     theta = pairs.get(posterior.theta_key).double()
     z = posterior.prior.standardize(theta)
     volume = posterior.prior.standardization.log_abs_det_jacobian(z, theta)
-    weight = pairs.get("weight", None)
-    weight = z.new_ones(len(z)) if weight is None else weight.reshape(len(z)).double()
     scaled = posterior.network.scaled(pairs.get(posterior.summary_key))
-    return _Pairs(scaled, z, volume, weight)
+    return _Pairs(scaled, z, volume, weights_of(pairs).to(z))
 
 
 def _loss(posterior: MixtureDensityPosterior, pairs: _Pairs, *, truncated: bool) -> Tensor:
@@ -150,10 +149,7 @@ def _loss(posterior: MixtureDensityPosterior, pairs: _Pairs, *, truncated: bool)
         diagonal=network.covariance == "diagonal",
         points=TRAINING_POINTS,
     )
-    weight = pairs.weight
-    loss = pairs.volume - mixture.log_prob(pairs.z)
-    total = torch.where(weight > 0, weight * loss, 0.0).sum()
-    return total / weight.sum().clamp_min(torch.finfo(weight.dtype).tiny)
+    return weighted_mean(pairs.volume - mixture.log_prob(pairs.z), pairs.weight)
 
 
 def _check_loss(loss: Tensor) -> None:

@@ -14,10 +14,10 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
 
 from .posterior import MixtureDensityPosterior
 from .truncation import TruncatedGaussianMixture
+from .weights import weighted_mean, weights_of
 
 _WIDER = (1.0, 1.05, 1.1, 1.15, 1.2, 1.3, 1.4, 1.5, 1.75, 2.0)
 _NARROWER = (0.7, 0.75, 0.8, 0.85, 0.9, 0.95)
@@ -35,13 +35,12 @@ def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase)
     """
     first, alone = networks[0], len(networks) == 1
     z = first.prior.standardize(held_out.get(first.theta_key).double())
-    weight = held_out.get("weight", None)
-    weight = z.new_ones(len(z)) if weight is None else weight.reshape(len(z)).double()
+    weight = weights_of(held_out).to(z)
     scores = {}
     for factor in _WIDER if alone else _NARROWER + _WIDER:
         _set(networks, factor)
         members = [network.get_dist(held_out.copy()).mixture for network in networks]
-        scores[factor] = _mean(average(members).log_prob(z), weight)
+        scores[factor] = weighted_mean(average(members).log_prob(z), weight).item()
     best = max(scores, key=scores.__getitem__)
     return _set(networks, best if alone else _RESERVE * best)
 
@@ -50,11 +49,6 @@ def _set(networks: Sequence[MixtureDensityPosterior], factor: float) -> float:
     for network in networks:
         network.network.widening.fill_(factor)
     return factor
-
-
-def _mean(log_prob: Tensor, weight: Tensor) -> float:
-    total = torch.where(weight > 0, weight * log_prob, 0.0).sum()
-    return (total / weight.sum().clamp_min(torch.finfo(weight.dtype).tiny)).item()
 
 
 def average(members: Sequence[TruncatedGaussianMixture]) -> TruncatedGaussianMixture:
