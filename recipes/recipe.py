@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "torchrl_bayessim")
 SEEDS = 2**32
 THREADS = 1024
+MATMUL_PRECISIONS = ("highest", "high", "medium")
 FREE = ("progress", "debug", "logger")  # settings that a resumed run may change
 
 
@@ -45,6 +46,7 @@ class Settings:
     seed: int = 0
     out: str = ""  # folder; outputs/NAME/TIME by default
     threads: int = 1  # of torch, for which batches are small; simulations have their own
+    matmul_precision: str = "highest"  # of torch; "medium": bfloat16 products where CPUs have them
     progress: bool = True
     debug: bool = False
 
@@ -77,6 +79,7 @@ def main(settings_type: type[S], job: Callable[[S, Path], dict[str, Any]]) -> No
     try:
         settings = parse(settings_type, sys.argv[1:])
         torch.set_num_threads(settings.threads)
+        torch.set_float32_matmul_precision(settings.matmul_precision)
         folder = Path(settings.out or f"outputs/{name}/{datetime.now():%Y-%m-%d_%H-%M-%S}")
         made = opened(folder)
         made, alone = [*begun(settings, folder), *made], True
@@ -202,6 +205,9 @@ def parse(settings_type: type[S], arguments: list[str]) -> S:
         raise ValueError(message(f"a seed from 0 to {SEEDS - 1}", settings.seed))
     if not 1 <= settings.threads <= THREADS:
         raise ValueError(message(f"threads from 1 to {THREADS}", settings.threads))
+    if settings.matmul_precision not in MATMUL_PRECISIONS:
+        expected, given = "a matmul_precision of torch", settings.matmul_precision
+        raise ValueError(message(expected, given, available=MATMUL_PRECISIONS))
     keys = [argument.partition("=")[0] for argument in arguments]
     return resumed(settings, keys) if getattr(settings, "resume", "") else settings
 
@@ -258,6 +264,7 @@ def provenance(settings: Settings, *, seconds: float) -> dict[str, Any]:
             "system": platform.platform(),
             "cores": os.cpu_count(),
             "threads": torch.get_num_threads(),
+            "matmul_precision": torch.get_float32_matmul_precision(),
         },
         "seconds": round(seconds, 2),
     }

@@ -11,14 +11,22 @@ import torch
 
 
 def workers(count: int, *, threads: int) -> ProcessPoolExecutor:
-    """Return a pool of ``count`` processes of their own interpreters, each of so many threads."""
-    spawn = get_context("spawn")
-    return ProcessPoolExecutor(count, mp_context=spawn, initializer=begin, initargs=(threads,))
+    """Return a pool of ``count`` processes of their own interpreters, each of so many threads.
+
+    Their matrix products are as precise as this process's are now.
+    """
+    return ProcessPoolExecutor(
+        count,
+        mp_context=get_context("spawn"),
+        initializer=begin,
+        initargs=(threads, torch.get_float32_matmul_precision()),
+    )
 
 
-def begin(threads: int) -> None:
-    """Set the threads of this process, and end it when its parent ends."""
+def begin(threads: int, matmul_precision: str) -> None:
+    """Set how this process calculates, and end it when its parent ends."""
     torch.set_num_threads(threads)
+    torch.set_float32_matmul_precision(matmul_precision)
     parent = parent_process()
     assert parent is not None  # it was spawned
 

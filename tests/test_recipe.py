@@ -73,7 +73,7 @@ def test_the_result_has_what_others_read(finished):
     assert result["baseline"]["source"] == "prior"
     told = result["provenance"]
     assert {"commit", "versions", "seed", "command", "machine", "seconds"} <= told.keys()
-    assert {"cores", "threads"} <= told["machine"].keys()
+    assert {"cores", "threads", "matmul_precision"} <= told["machine"].keys()
     assert told["seed"] == 0
     assert "short=true" in told["command"]
 
@@ -200,6 +200,7 @@ def refused(tmp_path, monkeypatch, capsys):
         ("rounds", "expected arguments of the form key=value, got 'rounds'"),
         ("rounds=0", "expected rounds to be positive, got 0"),
         ("threads=0", "expected threads from 1 to 1024, got 0"),
+        ("matmul_precision=lowest", "got 'lowest'. Available: highest, high, medium"),
         ("updates=-1", "expected updates not to be negative, got -1"),
         ("resume=nowhere", "expected the folder of a run to resume, got 'nowhere'"),
     ],
@@ -334,3 +335,17 @@ def test_a_part_that_is_kept_is_not_done_again(tmp_path, monkeypatch):
     first, again = (kept(tmp_path / "parts" / "seed1.json", work) for _ in range(2))
     assert first == again == {"mean": None, "seeds": [1, 2]}
     assert done == ["once"]
+
+
+def test_workers_calculate_as_the_recipe_does(monkeypatch):
+    monkeypatch.syspath_prepend(RECIPE.parent)
+    import torch
+    from workers import workers
+
+    before = torch.get_float32_matmul_precision()
+    try:
+        torch.set_float32_matmul_precision("high")
+        with workers(1, threads=1) as pool:
+            assert pool.submit(torch.get_float32_matmul_precision).result() == "high"
+    finally:
+        torch.set_float32_matmul_precision(before)

@@ -7,6 +7,7 @@ turns, so ratios are within a run. ``collect`` is the loop without its updates, 
 of it; environment frames per second. ``updates=0.2`` (per frame) is the recipe's setting::
 
     python recipes/benchmarks/fetch_training.py [task=FetchPush-v4] [runs=5] [updates=0.2]
+        [matmul_precision=medium]
 """
 
 from __future__ import annotations
@@ -76,12 +77,14 @@ def loop(env: EnvBase, updates: float, batches: int) -> Callable[[], int]:
 def main(*arguments: str) -> None:
     """Measure both loops in turn, without and with updates."""
     given = {"task": "FetchPush-v4", "n": "16", "runs": "5", "updates": "0.2", "threads": "1"}
-    given |= {"batches": "1"} | dict(argument.split("=", 1) for argument in arguments)
+    given |= {"batches": "1", "matmul_precision": "medium"}
+    given |= dict(argument.split("=", 1) for argument in arguments)
     task, n, threads = given["task"], int(given["n"]), int(given["threads"])
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore")
     gymnasium.register_envs(gymnasium_robotics)
     torch.set_num_threads(threads)
+    torch.set_float32_matmul_precision(given["matmul_precision"])
     cases = {}
     for name, updates in {"collect": 0.0, "train": float(given["updates"])}.items():
         batches = int(given["batches"])
@@ -92,6 +95,7 @@ def main(*arguments: str) -> None:
         other = f"{name}, gymnasium-robotics"
         against = {other: rates[other]} if other in rates else {}
         context = {"task": task, "n": n, "threads": threads, "seed": 0, "updates": given["updates"]}
+        context["matmul_precision"] = given["matmul_precision"]
         report("fetch_training", name, values, against=against, **context)
 
 
