@@ -114,6 +114,14 @@ def test_dry_friction_is_named_and_measured():
     assert report.where["channel"]["body"] == 1.0
 
 
+def test_a_gap_that_nothing_explains_is_not_called_none():
+    data = logs(push=lambda q, v: -0.05 * np.tanh(v / 0.01))  # hardly seen in the validation run
+    report = diagnose(system(), None, data, effects=["quadratic_drag", "parallel_spring"])
+    assert report.verdict == "unknown"
+    assert not report.effects
+    assert "It is real, but none of the 2 effects" in str(report)
+
+
 def test_a_limit_that_was_never_reached_is_asked_for_with_larger_commands(monkeypatch):
     strong = commands
     monkeypatch.setitem(globals(), "commands", lambda *args: np.clip(0.6 * strong(*args), -2, 2))

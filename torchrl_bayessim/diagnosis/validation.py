@@ -5,20 +5,21 @@ Effects were chosen on them too, which flatters the share: so it must be larger,
 
 from __future__ import annotations
 
-__all__ = ["NAMED", "SHOWN", "enough", "hardly_shown", "share_on_validation"]
+__all__ = ["NAMED", "SHOWN", "SURE", "enough", "hardly_shown", "share_on_validation"]
 
 from .selection import Selection
 from .shrinkage import Shrinkage
 
 NAMED = 0.8  # share of the gap that a cause without reserve explains
 SHOWN = 1.2  # mean squared innovation of runs that show a gap
-_SURE, _LARGELY = 1e-5, 0.6  # p-value of the gap, and the share that is then enough
+SURE = 1e-5  # p-value of a gap that is there
+_LARGELY = 0.6  # share of such a gap that is enough
 _GONE = 50.0  # squares that are surely not of chance
 
 
 def enough(p_value: float) -> float:
     """Return the share on validation runs that names a cause, for a gap of this p-value."""
-    return _LARGELY if p_value < _SURE else NAMED
+    return _LARGELY if p_value < SURE else NAMED
 
 
 def hardly_shown(measured: Shrinkage) -> bool:

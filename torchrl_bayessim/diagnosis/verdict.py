@@ -29,7 +29,7 @@ from .preparation import Prepared
 from .report import Candidate, Finding, Verdict
 from .selection import Selection
 from .shrinkage import Shrinkage
-from .validation import NAMED, SHOWN, enough, hardly_shown, share_on_validation
+from .validation import NAMED, SHOWN, SURE, enough, hardly_shown, share_on_validation
 
 _NEGLIGIBLE = 0.05  # of the noise floor: an excess that no one would chase
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
@@ -139,11 +139,13 @@ class _Weighed:
         alpha: float,
     ) -> _Weighed:
         p_value = selection.p_values[0]
-        others = selection.nominal.fit.innovations, selection.nominal.validation
+        innovations = selection.nominal.fit.innovations, selection.nominal.validation
+        others = [float((m**2).mean()) for m in innovations]
         certain = p_value < _CERTAIN
-        least = min(measured.refit, *(float((m**2).mean()) for m in others))
-        shown = least > _UNEXPLAINED or (measured.refit > SHOWN and certain)
-        visible = least > _PLAIN or (measured.excess_ci[0] > 0 and shown)
+        least, lowest = min(measured.refit, *others), 1.0 + measured.excess_ci[0]
+        shown = least > _UNEXPLAINED or (measured.refit > SHOWN and p_value < SURE)
+        shown |= lowest > SHOWN and max(others) > _UNEXPLAINED
+        visible = least > _PLAIN or (lowest > 1.0 and shown)
         validated = share_on_validation(selection) if effects else 0.0
         perhaps_nothing = measured.explained_ci[0] <= 0 and validated < _PARTIAL and not scattered
         unsaid = measured.explained < _PARTIAL or perhaps_nothing
@@ -225,7 +227,7 @@ def _sentence(
             "as described."
         )
     if verdict == "none":
-        return f"No gap above noise ({measured.refit:.2f} times the floor).{ruled_out}{untested}"
+        return f"{_no_gap(measured.refit)}{ruled_out}{untested}"
     if verdict == "not_testable":
         return f"These data cannot say: {hint}.{untested}"
     rules = where["regimes"]
@@ -256,6 +258,19 @@ def _sentence(
     if len(confused) > 1:
         text += f" Not separable from: {', '.join(confused[1:])}."
     return f"{text}{parameters}{untested}"
+
+
+def _no_gap(refit: float) -> str:
+    """Return that nothing is missing, of an error of so many noise floors on test runs.
+
+    >>> _no_gap(1.0312)
+    'No gap above noise (1.03 times the floor).'
+    >>> _no_gap(1.8)
+    'No gap that is surely above noise (1.80 times the floor on test runs).'
+    """
+    if refit <= SHOWN:
+        return f"No gap above noise ({refit:.2f} times the floor)."
+    return f"No gap that is surely above noise ({refit:.2f} times the floor on test runs)."
 
 
 def _much(rule: Mapping[str, Any]) -> bool:
