@@ -122,6 +122,17 @@ def test_a_gap_that_nothing_explains_is_not_called_none():
     assert "It is real, but none of the 2 effects" in str(report)
 
 
+@pytest.mark.parametrize("at", [0, 3])  # of the test runs, of the training runs
+def test_a_run_that_departs_alone_is_said_to(at):
+    pushed, held = logs(push=lambda q, v: -0.3 * np.tanh(v / 0.01)), logs()
+    report = diagnose(
+        system(), None, [*held[:at], pushed[at], *held[at + 1 :]], effects=["parallel_spring"]
+    )
+    assert report.verdict == "unknown"
+    assert f"It is real, but only in run{at}: did something happen there?" in str(report)
+    assert any(alarm.startswith(f"run{at} is ") for alarm in report.alarms)
+
+
 def test_a_limit_that_was_never_reached_is_asked_for_with_larger_commands(monkeypatch):
     strong = commands
     monkeypatch.setitem(globals(), "commands", lambda *args: np.clip(0.6 * strong(*args), -2, 2))

@@ -28,6 +28,7 @@ from .figures import figures
 from .location import location
 from .model import Model, gain, needed
 from .objective import Objective, Point, Unit, strengths_of
+from .odd_runs import odd_run_alarms, odd_runs
 from .preparation import Prepared
 from .report import Candidate, Finding, Gap, Parameter, Report
 from .rollout import rollout_errors
@@ -80,6 +81,7 @@ def assemble(
     parameters = _parameters(system, prepared, selection)
     where, remainder = _locations(prepared, selection, credit)
     rollouts = rollout_errors(prepared, points)
+    odd = odd_runs(prepared.sets, prepared.logs, best.fit.point)
     verdict, summary, more = conclude(
         system,
         prepared,
@@ -91,6 +93,7 @@ def assemble(
         scattered=scatter.groups,
         where=where,
         diverges=diverges_throughout(rollouts),
+        odd=odd,
         doubts=doubts(found.effects, _every_unit(selection, scatter), prepared),
         alpha=alpha,
     )
@@ -99,6 +102,7 @@ def assemble(
         found = replace(found, effects=(), strengths={}, confused=())
         seen = tuple(replace(c, status="rejected") if c.status == "named" else c for c in seen)
     alarms = [*prepared.alarms, *(str(f) for f in findings), *_absorbed(parameters)]
+    alarms += odd_run_alarms(odd)
     named = ["as described", "with fitted parameters", "with the effects"][: 2 + bool(best.units)]
     alarms += divergence_alarms(
         prepared.sets["test"], dict(zip(named, points.values(), strict=False))

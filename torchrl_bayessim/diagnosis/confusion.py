@@ -13,6 +13,7 @@ from .model import Model, as_good
 from .objective import Objective
 from .selection import Selection, parts
 
+_SAME = 2.0  # of a deviance: what fits of one and the same law may differ by
 _LAST = 0.01  # of what an effect explains: too little to prefer one law to another
 _FORM = 0.1  # of the same: how well the form of a law is known
 _OTHER = 0.03  # of the same, by a law of another kind, where the best is not the true one
@@ -91,6 +92,11 @@ def _alike(one: Effect, other: Effect) -> bool:
     return len(groups) == 1 or (servo and "friction" in groups)
 
 
+def _sensing(model: Model) -> int:
+    """Return how many faults of sensors a model has."""
+    return sum(unit.effect.channel == "sensing" for unit in model.units)
+
+
 def rivals(selection: Selection, name: str, *, form: float = _LAST) -> list[Model]:
     """Return the models with another effect in the place of one that are as good as the best.
 
@@ -127,10 +133,15 @@ def stand_in(selection: Selection, rival: Model) -> str:
 def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> Selection:
     """Return the selection with that one of equals in front that explains most.
 
-    Of training and validation: test runs choose nothing.
+    Of training and validation: test runs choose nothing. Of those that explain the same to the
+    last, such as late commands and late sensors, it is the one with fewer faults of sensors: it
+    needs no names of channels to be put on a simulator.
     """
     equals = [selection.best, *rivals(selection, name)]
-    first = min(equals, key=lambda model: float(model.deviances().sum()))
+    deviances = {model: float(model.deviances().sum()) for model in equals}
+    least = min(deviances.values())
+    same = [model for model in equals if deviances[model] - least < _SAME]
+    first = min(same, key=lambda model: (_sensing(model), deviances[model]))
     if first is selection.best:
         return selection
     others = tuple(m for m in (selection.best, *selection.alternatives[name]) if m is not first)

@@ -43,6 +43,7 @@ _DECIDED = 34.3  # 4 (1.645 + 1.282)²
 _LEVEL = 0.4  # of its range: an effect that could not be tested
 _MOST = 3  # proposals
 _SURE = 1e6  # odds beyond which figures say nothing
+_DELAYS = {"action_delay", "sensor_delay"}
 
 
 @dataclass(frozen=True)
@@ -108,8 +109,15 @@ def _confusions(selection: Selection, confused: Sequence[str]) -> list[_Question
     best, questions = selection.best, {}
     for rival in rivals(selection, confused[0]):
         pair = (confused[0], stand_in(selection, rival))
+        if set(pair) == _DELAYS and all(_whole(u) for u in (*best.units, *rival.units)):
+            continue  # no log can tell late commands from late sensors
         questions.setdefault(pair, _Question(pair, best.fit.point, rival.fit))
     return list(questions.values())
+
+
+def _whole(unit: Unit) -> bool:
+    """Return whether a delay of sensors is one of all of them."""
+    return unit.name != "sensor_delay" or unit.where == "all" or len(unit.direction) == 1
 
 
 def _untested(selection: Selection, units: Sequence[Unit]) -> list[_Question]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 __all__ = ["conclude"]
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Collection, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,20 +28,17 @@ from .divergence import HINT
 from .preparation import Prepared
 from .report import Candidate, Finding, Verdict
 from .selection import Selection
+from .sentence import sentence
 from .shrinkage import Shrinkage
-from .validation import NAMED, SHOWN, SURE, enough, hardly_shown, share_on_validation
+from .validation import NAMED, PARTIAL, SHOWN, SURE, enough, hardly_shown, share_on_validation
 
 _NEGLIGIBLE = 0.05  # of the noise floor: an excess that no one would chase
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
 _PLAIN = 4.0  # the same, to need no interval: few segments have a wide one, as about impacts
 _CERTAIN = 1e-15  # p-value of a gap that is too small to be seen at a glance
 _MOST = 0.5  # of the joints without measured velocity
-_WORSE = 1.2  # times the error as described, with parameters fitted to other runs
-_PLACE = 0.2  # of the error, to say that it sits there
 _NOISE_AGAIN = 2.0  # mean squared innovation: as much again as the noise
-_ALL, _PARTIAL = 0.98, 0.4
-# what readers know a law by, beside its strength
-_FORMS = {"frequency": ", {:.3g} Hz", "number": ", {:.3g} per turn or 2π m"}
+_ALL = 0.98
 
 
 def conclude(
@@ -56,6 +53,7 @@ def conclude(
     scattered: Set[str],
     where: Mapping[str, Any],
     diverges: bool,
+    odd: Collection[str],
     doubts: Sequence[str],
     alpha: float,
 ) -> tuple[Verdict, str, list[str]]:
@@ -72,6 +70,7 @@ def conclude(
         scattered: Groups of the effects of chance that were found.
         where: The error's place.
         diverges: Whether the simulator lives through no whole run.
+        odd: Runs that depart from the simulator, even with the effects, as no other does.
         doubts: Why nothing should be named without reserve.
         alpha: Level of the tests.
     """
@@ -80,7 +79,8 @@ def conclude(
     verdict: Verdict
     if obstacle is not None:
         verdict = "not_testable"
-    elif not effects:
+    elif all(low <= 0.0 <= high for low, high in (effect.ci95 for effect in effects)):
+        # nothing was found, or nothing that the data bear out
         verdict = "unknown" if weighed.visible else "none"
     else:
         groups = {u.effect.group for u in selection.best.units if u.name in confused[:1]}
@@ -88,10 +88,13 @@ def conclude(
         groups |= {u.effect.group for s in first for u in s.units if u.name in confused}
         verdict = weighed.named(ambiguous=len(groups | scattered) > 1 and len(confused) > 1)
     few = len(prepared.names["train"]) == 1 and prepared.alarms
-    if verdict == "named" and (few or doubts):
+    if verdict == "named" and (few or odd or doubts):
         verdict = "named_partial"
-    alarms = [obstacle[0]] if obstacle else [*doubts] if verdict.startswith("named") else []
-    sentence = _sentence(
+    if verdict == "none" and odd:
+        verdict = "unknown"
+    names = verdict.startswith("named") or verdict == "ambiguous"
+    alarms = [obstacle[0]] if obstacle else [*doubts] if names else []
+    text = sentence(
         verdict,
         system,
         prepared,
@@ -101,9 +104,10 @@ def conclude(
         confused=confused,
         validated=weighed.validated if weighed.elsewhere else None,
         where=where,
+        odd=odd,
         hint=obstacle[1] if obstacle else "",
     )
-    return verdict, sentence, alarms
+    return verdict, text, alarms
 
 
 @dataclass(frozen=True)
@@ -147,8 +151,8 @@ class _Weighed:
         shown |= lowest > SHOWN and max(others) > _UNEXPLAINED
         visible = least > _PLAIN or (lowest > 1.0 and shown)
         validated = share_on_validation(selection) if effects else 0.0
-        perhaps_nothing = measured.explained_ci[0] <= 0 and validated < _PARTIAL and not scattered
-        unsaid = measured.explained < _PARTIAL or perhaps_nothing
+        perhaps_nothing = measured.explained_ci[0] <= 0 and validated < PARTIAL and not scattered
+        unsaid = measured.explained < PARTIAL or perhaps_nothing
         elsewhere = unsaid and hardly_shown(measured) and validated >= enough(p_value)
         significant = p_value <= alpha or bool(scattered)
         return cls(measured, significant, certain, visible, validated, unsaid, elsewhere)
@@ -199,119 +203,3 @@ def _too_fast(prepared: Prepared) -> bool:
     guessed = segments.velocity_gain > 0
     known = segments.qvel.reshape(-1, segments.qvel.shape[-1]).std(0)
     return bool(guessed.any() and (segments.velocity_error > known)[guessed].mean() > _MOST)
-
-
-def _sentence(
-    verdict: Verdict,
-    system: System,
-    prepared: Prepared,
-    *,
-    measured: Shrinkage,
-    effects: Sequence[Finding],
-    candidates: Sequence[Candidate],
-    confused: Sequence[str],
-    validated: float | None,
-    where: Mapping[str, Any],
-    hint: str,
-) -> str:
-    gap = f"Gap: {measured.refit:.3g} times the noise floor on {prepared.horizon}-step prediction."
-    ruled_out = _ruled_out(candidates)
-    untested = _untested(candidates)
-    parameters = ""
-    if system.prior is not None and measured.raw > measured.refit:
-        share = (measured.raw - measured.refit) / max(measured.raw - 1.0, 1e-9)
-        parameters = f" Retuning parameters alone explains {_percent(share)}."
-    elif measured.refit > _WORSE * measured.raw:
-        parameters = (
-            f" Retuning parameters alone makes test runs worse: {measured.raw:.3g} times the floor "
-            "as described."
-        )
-    if verdict == "none":
-        return f"{_no_gap(measured.refit)}{ruled_out}{untested}"
-    if verdict == "not_testable":
-        return f"These data cannot say: {hint}.{untested}"
-    rules = where["regimes"]
-    place = f" It sits at {rules[0]['rule']}." if rules and _much(rules[0]) else ""
-    if verdict == "unknown":
-        best = max((c.explained_fraction for c in candidates), default=0.0)
-        best = max(best, measured.explained)
-        tried = len({c.name for c in candidates})
-        found = f"none of the {tried} effects that were tried explains more than {_percent(best)}"
-        if best >= _PARTIAL:
-            found = "what could explain it on some runs does not hold on others"
-        text = f"{gap} It is real, but {found}."
-        return f"{text}{place}{parameters}{untested}"
-    causes = ", and ".join(_described(e) for e in effects)
-    low, high = measured.elsewhere
-    share = f"explains {_percent(measured.explained)} [{100 * low:.0f}, {100 * high:.0f}] of it"
-    if validated is not None:
-        share = f"explains {_percent(validated)} of it on validation runs, test runs hardly show it"
-    if verdict == "ambiguous":
-        others = ", ".join(confused)
-        return (
-            f"{gap} These data cannot tell the causes apart: {others}. The first, {causes}, "
-            f"{share}.{parameters}{untested}"
-        )
-    text = f"{gap} Cause: {causes}, {share}"
-    partial = verdict != "named" and validated is None
-    text += f"; {_percent(1 - measured.explained)} remain." if partial else "."
-    if len(confused) > 1:
-        text += f" Not separable from: {', '.join(confused[1:])}."
-    return f"{text}{parameters}{untested}"
-
-
-def _no_gap(refit: float) -> str:
-    """Return that nothing is missing, of an error of so many noise floors on test runs.
-
-    >>> _no_gap(1.0312)
-    'No gap above noise (1.03 times the floor).'
-    >>> _no_gap(1.8)
-    'No gap that is surely above noise (1.80 times the floor on test runs).'
-    """
-    if refit <= SHOWN:
-        return f"No gap above noise ({refit:.2f} times the floor)."
-    return f"No gap that is surely above noise ({refit:.2f} times the floor on test runs)."
-
-
-def _much(rule: Mapping[str, Any]) -> bool:
-    """Return whether a place holds enough of the error to be where it sits."""
-    return bool(rule["share"] >= _PLACE)
-
-
-def _percent(share: float) -> str:
-    return f"{100 * max(share, 0.0):.0f} %"
-
-
-def _described(effect: Finding) -> str:
-    half = (effect.ci95[1] - effect.ci95[0]) / 2
-    place = "at all" if effect.where == "all" else f"at {effect.where}"
-    name = effect.name.replace("_", " ")
-    law = "".join(text.format(effect.form[k]) for k, text in _FORMS.items() if k in effect.form)
-    return f"{name} {place} ({effect.strength:.3g} ± {half:.2g} {effect.unit}{law})"
-
-
-def _ruled_out(candidates: Sequence[Candidate]) -> str:
-    """Return what would have been seen, for the effects that were not."""
-    found: dict[str, str] = {}
-    for c in candidates:
-        if c.status == "ruled_out" and c.minimal_detectable_strength is not None:
-            name, least = c.name.replace("_", " "), c.minimal_detectable_strength
-            text = f"{name} above {least:.2g} {_unit(c)}"
-            found.setdefault(c.name, text)
-    some = list(found.values())[:4]
-    more = f" and {len(found) - 4} more" if len(found) > 4 else ""
-    return f" Ruled out: {', '.join(some)}{more}." if some else ""
-
-
-def _unit(candidate: Candidate) -> str:
-    return f"at {candidate.where}" if candidate.where != "all" else "anywhere"
-
-
-def _untested(candidates: Sequence[Candidate]) -> str:
-    by_name: dict[str, list[str]] = {}
-    for c in candidates:
-        by_name.setdefault(c.name, []).append(c.status)
-    names = [name for name, seen in by_name.items() if set(seen) == {"not_excited"}]
-    shown = ", ".join(name.replace("_", " ") for name in names[:5])
-    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    return f" Could not be tested: {shown}{more}." if names else ""

@@ -27,6 +27,7 @@ from .system import System
 _FACTORS = np.linspace(np.log(1e-4), np.log(1e4), 47)
 _ALIKE = 0.1  # of a unit: degrees and gradians are as far apart
 FACTOR = "by a factor of about"  # which says that it is no unit
+_DIVERGED = 1e30  # of a misfit: as bad as any
 _ROWS = 1000  # in which a factor is sought
 _ANGLES = {np.pi / 180: "in degrees", np.pi / 200: "in gradians", 2 * np.pi: "in turns"}
 _LENGTHS = {0.01: "in hundredths", 0.0254: "in inches"}
@@ -132,7 +133,10 @@ def _best(misfit: Callable[[float], float]) -> float:
     near, step = _FACTORS[best], _FACTORS[1] - _FACTORS[0]
     bounds = (near - step, near + step)
     found: float = minimize_scalar(
-        lambda x: misfit(float(np.exp(x))), bounds=bounds, method="bounded", options={"xatol": 1e-3}
+        lambda x: min(misfit(float(np.exp(x))), _DIVERGED),
+        bounds=bounds,
+        method="bounded",
+        options={"xatol": 1e-3},
     ).x  # pyright: ignore[reportAttributeAccessIssue]
     return float(np.exp(found))
 

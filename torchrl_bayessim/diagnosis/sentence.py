@@ -1,0 +1,176 @@
+"""The sentence that a diagnosis ends in."""
+
+from __future__ import annotations
+
+__all__ = ["sentence"]
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from ..logs.system import System
+from .preparation import Prepared
+from .report import Candidate, Finding, Verdict
+from .shrinkage import Shrinkage
+from .validation import PARTIAL, SHOWN
+
+_WORSE = 1.2  # times the error as described, with parameters fitted to other runs
+_PLACE = 0.2  # of the error, to say that it sits there
+# what readers know a law by, beside its strength
+_FORMS = {"frequency": ", {:.3g} Hz", "number": ", {:.3g} per turn or 2π m"}
+
+
+def sentence(
+    verdict: Verdict,
+    system: System,
+    prepared: Prepared,
+    *,
+    measured: Shrinkage,
+    effects: Sequence[Finding],
+    candidates: Sequence[Candidate],
+    confused: Sequence[str],
+    validated: float | None,
+    where: Mapping[str, Any],
+    odd: Collection[str],
+    hint: str,
+) -> str:
+    """Return the verdict in words: gap, causes, what they explain, what could not be tested.
+
+    Args:
+        verdict: Its grade.
+        system: The robot.
+        prepared: Split, noise, horizon, nominal fit.
+        measured: How far the gap shrinks.
+        effects: What was found.
+        candidates: What the data say about every effect.
+        confused: Names that cannot be told from the cause, itself first.
+        validated: Share that is explained on validation runs, where they speak for test runs.
+        where: The error's place.
+        odd: Runs that depart from the simulator as no other does.
+        hint: What keeps these data from saying anything.
+    """
+    gap = f"Gap: {measured.refit:.3g} times the noise floor on {prepared.horizon}-step prediction."
+    ruled_out = _ruled_out(candidates)
+    untested = _untested(candidates)
+    parameters = ""
+    if system.prior is not None and measured.raw > measured.refit:
+        share = (measured.raw - measured.refit) / max(measured.raw - 1.0, 1e-9)
+        parameters = f" Retuning parameters alone explains {_percent(share)}."
+    elif measured.refit > _WORSE * measured.raw:
+        parameters = (
+            f" Retuning parameters alone makes test runs worse: {measured.raw:.3g} times the floor "
+            "as described."
+        )
+    if verdict == "none":
+        return f"{_no_gap(measured.refit)}{ruled_out}{untested}"
+    if verdict == "not_testable":
+        return f"These data cannot say: {hint}.{untested}"
+    rules = where["regimes"]
+    f" It sits at {rules[0]['rule']}." if rules and _much(rules[0]) else ""
+    if verdict == "unknown":
+        real = _unknown(measured, candidates, odd, where["regimes"])
+        return f"{gap} It is real, {real}{parameters}{untested}"
+    causes = ", and ".join(_described(e) for e in effects)
+    low, high = measured.elsewhere
+    share = f"explains {_percent(measured.explained)} [{100 * low:.0f}, {100 * high:.0f}] of it"
+    if validated is not None:
+        share = f"explains {_percent(validated)} of it on validation runs, test runs hardly show it"
+    if verdict == "ambiguous":
+        others = ", ".join(confused)
+        return (
+            f"{gap} These data cannot tell the causes apart: {others}. The first, {causes}, "
+            f"{share}.{parameters}{untested}"
+        )
+    text = f"{gap} Cause: {causes}, {share}"
+    partial = verdict != "named" and validated is None
+    text += f"; {_percent(1 - measured.explained)} remain." if partial else "."
+    if len(confused) > 1:
+        text += f" Not separable from: {', '.join(confused[1:])}."
+    return f"{text}{parameters}{untested}"
+
+
+def _unknown(
+    measured: Shrinkage,
+    candidates: Sequence[Candidate],
+    odd: Collection[str],
+    rules: Sequence[Mapping[str, Any]],
+) -> str:
+    """Return why a gap has no cause that could be named."""
+    if odd:
+        return f"but only in {', '.join(odd)}: did something happen there?"
+    place = f" It sits at {rules[0]['rule']}." if rules and _much(rules[0]) else ""
+    best = max((c.explained_fraction for c in candidates), default=0.0)
+    best = max(best, measured.explained)
+    tried = len({c.name for c in candidates})
+    found = f"none of the {tried} effects that were tried explains more than {_percent(best)}"
+    if best >= PARTIAL:
+        found = "what could explain it on some runs does not hold up"
+    return f"but {found}.{place}"
+
+
+def _no_gap(refit: float) -> str:
+    """Return that nothing is missing, of an error of so many noise floors on test runs.
+
+    >>> _no_gap(1.0312)
+    'No gap above noise (1.03 times the floor).'
+    >>> _no_gap(1.8)
+    'No gap that is surely above noise (1.80 times the floor on test runs).'
+    """
+    if refit <= SHOWN:
+        return f"No gap above noise ({refit:.2f} times the floor)."
+    return f"No gap that is surely above noise ({refit:.2f} times the floor on test runs)."
+
+
+def _much(rule: Mapping[str, Any]) -> bool:
+    """Return whether a place holds enough of the error to be where it sits."""
+    return bool(rule["share"] >= _PLACE)
+
+
+def _percent(share: float) -> str:
+    """Return a share in per cent, all of it and nothing only where it is so.
+
+    >>> [_percent(share) for share in (-0.1, 0.0, 0.002, 0.5, 0.998, 1.0)]
+    ['0 %', '0 %', 'under 1 %', '50 %', 'over 99 %', '100 %']
+    """
+    text = f"{100 * max(share, 0.0):.0f} %"
+    if text == "0 %" and share > 0.0:
+        return "under 1 %"
+    return "over 99 %" if text == "100 %" and share < 1.0 else text
+
+
+def _described(effect: Finding) -> str:
+    half = (effect.ci95[1] - effect.ci95[0]) / 2
+    name = effect.name.replace("_", " ")
+    law = "".join(text.format(effect.form[k]) for k, text in _FORMS.items() if k in effect.form)
+    if len(effect.strengths) > 1:
+        least, most = (pick(effect.strengths.values()) for pick in (min, max))
+        sizes = f"{least:.3g} to {most:.3g} {effect.unit}, mean {effect.strength:.3g} ± {half:.2g}"
+        return f"{name} at {len(effect.strengths)} places ({sizes}{law})"
+    place = "at all" if effect.where == "all" else f"at {effect.where}"
+    return f"{name} {place} ({effect.strength:.3g} ± {half:.2g} {effect.unit}{law})"
+
+
+def _ruled_out(candidates: Sequence[Candidate]) -> str:
+    """Return what would have been seen, for the effects that were not."""
+    found: dict[str, str] = {}
+    for c in candidates:
+        if c.status == "ruled_out" and c.minimal_detectable_strength is not None:
+            name, least = c.name.replace("_", " "), c.minimal_detectable_strength
+            text = f"{name} above {least:.2g} {_unit(c)}"
+            found.setdefault(c.name, text)
+    some = list(found.values())[:4]
+    more = f" and {len(found) - 4} more" if len(found) > 4 else ""
+    return f" Ruled out: {', '.join(some)}{more}." if some else ""
+
+
+def _unit(candidate: Candidate) -> str:
+    return f"at {candidate.where}" if candidate.where != "all" else "anywhere"
+
+
+def _untested(candidates: Sequence[Candidate]) -> str:
+    by_name: dict[str, list[str]] = {}
+    for c in candidates:
+        by_name.setdefault(c.name, []).append(c.status)
+    names = [name for name, seen in by_name.items() if set(seen) == {"not_excited"}]
+    shown = ", ".join(name.replace("_", " ") for name in names[:5])
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return f" Could not be tested: {shown}{more}." if names else ""
