@@ -122,6 +122,16 @@ def test_a_gap_that_nothing_explains_is_not_called_none():
     assert "It is real, but none of the 2 effects" in str(report)
 
 
+def test_late_commands_stand_before_late_sensors_which_no_log_tells_apart():
+    late = logs(act=lambda u, k: u[max(k - 2, 0)])
+    for names in (["action_delay", "sensor_delay"], ["sensor_delay", "action_delay"]):
+        report = diagnose(system(), None, late, effects=names)
+        assert report.verdict == "named"
+        assert [effect.name for effect in report.effects] == ["action_delay"]
+        assert report.confusion_set == ("action_delay", "sensor_delay")
+        assert not report.next_experiment
+
+
 @pytest.mark.parametrize("at", [0, 3])  # of the test runs, of the training runs
 def test_a_run_that_departs_alone_is_said_to(at):
     pushed, held = logs(push=lambda q, v: -0.3 * np.tanh(v / 0.01)), logs()

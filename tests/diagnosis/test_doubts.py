@@ -52,6 +52,17 @@ def test_commands_that_never_change_name_nothing_without_reserve():
         assert any("no command ever changes" in alarm for alarm in report.alarms)
 
 
+def test_a_cause_whose_interval_holds_zero_is_none(monkeypatch):
+    monkeypatch.setattr(
+        "torchrl_bayessim.diagnosis.assembly.strength_errors",
+        lambda fit, *_: dict.fromkeys(fit.units, 1.0),  # N m, of 0.15
+    )
+    report = diagnose(system(), None, logs(push=friction), effects=["coulomb_friction"])
+    assert report.verdict == "unknown"
+    assert not report.effects
+    assert "what could explain it on some runs does not hold up" in report.summary
+
+
 @pytest.mark.parametrize(
     ("raw", "refit", "throughout"),
     [(np.inf, np.inf, True), (np.inf, 0.1, False), (0.2, 0.1, False)],
