@@ -72,8 +72,8 @@ class Candidate:
         held_out_gain: Validation deviance that it removed alone; ``None`` where it was not fitted.
         explained_fraction: Of the explainable error, alone.
         explained_by_parameters: Share of its signature that parameters would swallow.
-        minimal_detectable_strength: What would have been seen with probability 0.8; ``None`` where
-            not even the largest plausible strength.
+        minimal_detectable_strength: What the runs would have shown, trained on or not; ``None``
+            where not even the largest plausible strength.
         status: What became of it.
         form: What its law has beside the strength, as in :class:`Finding`.
     """

@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 LEVELS = (0.05, 0.4)  # of an effect's range
 _WILD = 500.0  # standard deviations
 _POWER = 0.84  # of the normal distribution at 0.8, to state what would have been seen
+_HELD_OUT = 2.0  # times that, for other runs to show it too
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,12 +94,14 @@ class Screen:
         return np.maximum(noise, 0.0).max(1) ** 2
 
     def detectable(self, alpha: float) -> dict[Unit, float]:
-        """Return the least strength of each unit that would be seen with probability 0.8.
+        """Return the least strength of each unit that a diagnosis would not call nothing.
 
-        ``‖g(s)‖`` reaches the threshold of a search over all units at level ``alpha``; strengths
+        ``‖g(s)‖`` reaches twice what a search over all units at level ``alpha`` sees with
+        probability 0.8, since runs that it was not fitted on must show the effect too. Strengths
         between levels by power laws, ``inf`` where even the highest level is not seen.
         """
-        threshold = np.sqrt(2 * np.log(max(len(set(self.units)), 2) / alpha)) + _POWER
+        seen = np.sqrt(2 * np.log(max(len(set(self.units)), 2) / alpha)) + _POWER
+        threshold = _HELD_OUT * seen
         norms = self.sizes * self.growth
         result: dict[Unit, float] = {}
         for unit in dict.fromkeys(self.units):
