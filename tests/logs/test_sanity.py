@@ -42,6 +42,33 @@ ARM = """
 """
 
 
+FAST = """
+<mujoco>
+  <option timestep="0.002"/>
+  <default><geom contype="0" type="capsule"/></default>
+  <worldbody>
+    <body>
+      <joint name="j1" axis="0 1 0" damping="0.1" armature="0.01"/>
+      <geom fromto="0 0 0 0 0 -.4" size=".03" mass="1.2"/>
+      <body pos="0 0 -.4">
+        <joint name="j2" axis="0 1 0" damping="0.06" armature="0.005"/>
+        <geom fromto="0 0 0 0 0 -.35" size=".025" mass=".8"/>
+        <body pos="0 0 -.35">
+          <joint name="j3" axis="1 0 0" damping="0.03" armature="0.003"/>
+          <geom fromto="0 0 0 0 0 -.2" size=".02" mass=".3"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor joint="j1" ctrlrange="-8 8"/>
+    <motor joint="j2" ctrlrange="-3 3"/>
+    <motor joint="j3" ctrlrange="-.5 .5"/>
+  </actuator>
+</mujoco>
+"""
+
+
 def arm(xml):
     """A model at 100 Hz."""
     return Task(model=mujoco.MjModel.from_xml_string(xml), frame_skip=5)
@@ -56,13 +83,14 @@ SYSTEMS = {
     "cartpole": (lambda: simulator_task("dm_control:cartpole/swingup", None, None), "body_mass[1]"),
 }
 
+SWING = {"swing": (lambda: arm(FAST), "body_mass[1]")}
 WITH_IMPACTS = {"half_cheetah": (lambda: known_task("HalfCheetah-v5"), "body_mass[torso]")}
 
 
 @cache
 def simulated(name, *, count=6, steps=300, noise=(1e-3, 1e-2), seed=0):
     """Simulate logs under random smooth actions and a mass that is not the nominal one."""
-    make, mass = (SYSTEMS | WITH_IMPACTS)[name]
+    make, mass = (SYSTEMS | SWING | WITH_IMPACTS)[name]
     task = make()
     model = task.model
     rng = np.random.default_rng(seed)
@@ -490,13 +518,25 @@ def test_a_push_is_found_and_friction_is_not_a_push():
     assert all(140 <= f.rows[0] <= f.rows[1] <= 170 for f in found)
 
 
-def _pushed_arm(*, rows, force):
-    model = SYSTEMS["arm"][0]().model
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_push_is_told_from_a_fast_swing(seed):
+    """Whose forces change within the windows over which they are averaged."""
+    system, records = simulated("swing", seed=seed)
+    assert not kinds(check(records, system))
+    pushed = _pushed_arm(rows=range(150, 160), force=40.0, model=system.task.model)
+    found = [f for f in check([pushed, *records], system) if f.kind == "push"]
+    assert {f.file for f in found} == {"pushed.csv"}
+    assert found[0].rows[0] < 160
+    assert found[0].rows[1] > 150
+
+
+def _pushed_arm(*, rows, force, model=None):
+    model = model or SYSTEMS["arm"][0]().model
     data = mujoco.MjData(model)
     rng = np.random.default_rng(3)
     columns = {"time": [], "qpos": [], "qvel": [], "ctrl": []}
     for t in range(300):
-        data.ctrl[:] = rng.uniform(-0.8, 0.8, 2) if t % 10 == 0 else data.ctrl
+        data.ctrl[:] = rng.uniform(-0.8, 0.8, model.nu) if t % 10 == 0 else data.ctrl
         data.qfrc_applied[0] = force if t in rows else 0.0
         for name, column in columns.items():
             column.append(np.copy(getattr(data, name)))
