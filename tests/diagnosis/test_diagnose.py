@@ -26,8 +26,8 @@ BOUNDS = {"body_mass[link]": (0.4, 0.9), "dof_damping[hinge]": (0.0, 0.2)}
 FINER = 4
 
 
-def system():
-    model = mujoco.MjModel.from_xml_string(ARM)
+def system(xml=ARM):
+    model = mujoco.MjModel.from_xml_string(xml)
     task = Task(model=model, frame_skip=5)
     return System(task=task, physics=MujocoPhysics(*BOUNDS), prior=BoxPrior(BOUNDS))
 
@@ -38,9 +38,9 @@ def commands(rng, steps):
     return np.clip(np.sum(waves, axis=0), -4, 4)
 
 
-def run(rng, steps, act=lambda u, k: u[k], push=lambda q, v: 0.0):
+def run(rng, steps, *, act=lambda u, k: u[k], push=lambda q, v: 0.0, xml=ARM):
     """Return what a robot with another mass and damping does, measured with noise."""
-    model = mujoco.MjModel.from_xml_string(ARM)
+    model = mujoco.MjModel.from_xml_string(xml)
     model.body_mass[1] *= 1.1
     model.body_inertia[1] *= 1.1
     model.dof_damping[0] = 0.08

@@ -272,6 +272,44 @@ def test_transmissions_have_no_place_on_actuators_of_unknown_force():
         assert effect(name).targets(robot) == ()
 
 
+@pytest.mark.parametrize(
+    ("damped", "far", "near"),
+    # a distance of 0.3 or 0.02 from the target, and a damping that is worth 0.1 of it
+    [(True, -0.05, 0.05), (False, -0.05, -0.02)],
+)
+def test_the_dead_band_of_a_servo_holds_its_damping_too_or_not(damped, far, near):
+    robot = servo('kp="20" kv="2"')
+    law = effect("dead_band", damped=damped).on(robot)
+    added = [band(law, robot, target=0.5 + e, qpos=0.5, qvel=1.0) for e in (0.3, 0.02)]
+    assert added == pytest.approx([far, near])
+
+
+def test_only_servos_with_damping_have_a_dead_band_without_it():
+    forms = effect("dead_band").forms(9.0)
+    assert forms == (effect("dead_band"), effect("dead_band", damped=False))
+    for robot, some in (
+        (servo('kp="20" kv="2"'), [("servo",), ("servo",)]),
+        (servo('kp="20"'), [("servo",), ()]),
+        (ROBOT, [("motor",), ()]),
+    ):
+        assert [form.on(robot).targets(robot) for form in forms] == some
+
+
+def servo(gains):
+    xml = f"""
+    <mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody>
+    <actuator><position name="servo" joint="j" {gains}/></actuator></mujoco>"""
+    return robot_of(Task(model=mujoco.MjModel.from_xml_string(xml), frame_skip=1))
+
+
+def band(law, robot, *, target, qpos, qvel):
+    """Return what a band of 0.05 adds to the command."""
+    values = {"qpos": qpos, "qvel": qvel, "ctrl": target, "time": 0.0}
+    state = Readings(**{name: torch.tensor([value]).double() for name, value in values.items()})
+    added, _ = Forcing(robot)([(law, torch.tensor([0.05]).double())], [{}], state)
+    return added["ctrl"].item()
+
+
 def test_actuator_forces_are_those_of_mujoco():
     robot, rng = arm(), np.random.default_rng(0)
     data = mujoco.MjData(robot.model)

@@ -131,13 +131,28 @@ class DeadBand(ActionEffect):
 
     In units of the command, 0 to 40 % of ``u_max``. A servo's band is around its target; see
     `ServoDeadBand`.
+
+    Args:
+        damped: Of servos: whether their damping is lost within the band too.
     """
 
     name, unit, group, memoryless = "dead_band", "command", "dead zone", True
 
+    def __init__(self, *, damped: bool = True) -> None:
+        self.damped = damped
+
+    def forms(self, seconds: float) -> tuple[Effect, ...]:
+        """Return the band with and without the damping."""
+        del seconds
+        return DeadBand(), DeadBand(damped=False)
+
     def on(self, robot: Robot) -> Effect:
         """Return the band of servos, where there is one."""
-        return ServoDeadBand() if servos(robot) else self
+        return ServoDeadBand(damped=self.damped) if servos(robot) else self
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the actuators' names, none if it is of servos only."""
+        return super().targets(robot) if self.damped else ()
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.4 ``u_max``."""

@@ -108,9 +108,21 @@ class ServoDeadBand(_Transmission):
     ``e' = sgn(e) max(|e| − s, 0)`` for the error ``e = F / g``, the force per unit of command: of a
     position servo the distance from its target, less what its damping adds; of a motor the command,
     as in `DeadBand`. In units of the command, up to 0.1 (6°).
+
+    Args:
+        damped: Whether the servo's damping is lost within the band too. Otherwise ``e`` is the
+            distance alone, and the damping acts everywhere; only servos with damping have that.
     """
 
     name, unit, group = "dead_band", "command", "dead zone"
+
+    def __init__(self, *, damped: bool = True) -> None:
+        self.damped = damped
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the actuators' names, none if the force of one is not known."""
+        names = super().targets(robot)
+        return names if self.damped or (names and bool(_damping(robot).any())) else ()
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and a tenth of a unit or of ``u_max``."""
@@ -121,8 +133,17 @@ class ServoDeadBand(_Transmission):
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
         """Return the change of commands."""
-        error = now.actuator_force / now.actuator_gain
+        force = now.actuator_force
+        if not self.damped:
+            force = force - _damping(now.robot).to(force) * now.actuator_velocity
+        error = force / now.actuator_gain
         return {"command": -error.clamp(-strength, strength)}, memory
+
+
+def _damping(robot: Robot) -> Tensor:
+    """Return the force of each actuator per unit of its velocity."""
+    model = robot.require_model()
+    return torch.from_numpy(model.actuator_biasprm[:, 2] * (model.actuator_biastype != 0))
 
 
 class Backlash(_Transmission):

@@ -1,0 +1,46 @@
+"""Dead bands of position servos, with the damping within the band or beside it."""
+
+import numpy as np
+import pytest
+from test_diagnose import ARM, logs, system
+
+from torchrl_bayessim.diagnosis.diagnose import diagnose
+
+KP, KV, BAND = 25.0, 1.0, 0.03
+SERVO = ARM.replace(
+    '<motor name="motor" joint="hinge" ctrlrange="-4 4"/>',
+    f'<position name="servo" joint="hinge" kp="{KP}" kv="{KV}"/>',
+)
+
+
+def banded(*, damped):
+    """Return the commands, and what a band takes from a servo, held for a control step."""
+    now = {}
+
+    def act(u, k):
+        now.update(target=0.4 * u[k], lost=None)
+        u[k] = now["target"]
+        return u[k]
+
+    def push(q, v):
+        if now["lost"] is None:
+            error = now["target"] - q - damped * KV / KP * v
+            now["lost"] = np.clip(error, -BAND, BAND)
+        return -KP * now["lost"]
+
+    return {"act": act, "push": push, "xml": SERVO}
+
+
+@pytest.mark.parametrize("damped", [True, False])
+def test_the_dead_band_of_a_servo_is_told_from_friction(damped):
+    report = diagnose(
+        system(SERVO),
+        None,
+        logs(**banded(damped=damped)),
+        effects=["dead_band", "coulomb_friction", "stribeck_friction", "action_gain"],
+    )
+    assert report.confusion_set == ("dead_band",)
+    (found,) = report.effects
+    assert found.form == {"damped": damped}
+    assert found.strength == pytest.approx(BAND, rel=0.1)
+    assert report.gap.explained_fraction > 0.8
