@@ -3,8 +3,8 @@ r"""Do logged actions push the way that joints accelerate, and does nothing else
 A factor :math:`\gamma` of the actuators far from 1 (see `inverse_dynamics`) means an action of
 another sign or unit, and only a force that no actuator could exert stands out of the rest. Where
 the regression is uncertain, nothing is found. What actuators could exert all logs tell together: in
-one they may hardly be used. A log whose motion or actions are in other units than in the rest is
-named by `units`, and says nothing here.
+one they may hardly be used. A log whose actions are in another order is named by `swaps`, one whose
+motion or actions are in other units than in the rest by `units`, and says nothing here.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from .columns import joint_names
 from .finding import Finding, runs
-from .inverse_dynamics import Fit, Terms, actuated_joints, dynamics, fit_terms, is_servo
+from .inverse_dynamics import Dynamics, Fit, Terms, actuated_joints, dynamics, fit_terms, is_servo
 from .log import Log
 from .record import Record
+from .swaps import check_swaps
 from .system import System
 from .units import check_units
 
@@ -44,9 +45,14 @@ def check_forces(
         for log in parts
         if len(log) >= 8 * half and bool(log.measured[: model.nv].all())
     ]
+    swapped = list(check_swaps(moved, system, half))
+    yield from swapped
+    if any(not finding.file for finding in swapped):
+        return
+    moved = _without(moved, swapped)
     odd = list(check_units(moved, system, half))
     yield from odd
-    moved = [one for one in moved if one.record.name not in {finding.file for finding in odd}]
+    moved = _without(moved, odd)
     usable = [(one.record, one.log) for one in moved]
     for joint, dof in actuated_joints(model):
         name = joint_names(model)[joint]
@@ -71,6 +77,11 @@ def check_forces(
             found += [_push(record, log, name, rows=rows) for rows in stretches]
         if len({f.file for f in found}) <= max(1, len(records) // 4):
             yield from found
+
+
+def _without(moved: Sequence[Dynamics], found: Sequence[Finding]) -> list[Dynamics]:
+    named = {finding.file for finding in found}
+    return [one for one in moved if one.record.name not in named]
 
 
 def _pushed(

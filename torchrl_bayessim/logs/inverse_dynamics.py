@@ -19,6 +19,7 @@ __all__ = [
     "actuated_joints",
     "dynamics",
     "fit_terms",
+    "held",
     "is_servo",
     "moves",
     "regressors",
@@ -95,14 +96,24 @@ def dynamics(model: mujoco.MjModel, record: Record, log: Log, half: int) -> Dyna
             free[t] = data.ncon == 0 and not barred & set(data.efc_type.tolist())
             mujoco.mj_mulM(model, data, needed[t], rate[t])
             needed[t] += data.qfrc_bias
-    window = np.ones(2 * half + 1) / (2 * half + 1)
-    # an action holds until the next row, so what acts around a row began half a step before
-    actuated = correlate1d((actuated + np.roll(actuated, 1, axis=0)) / 2, window, axis=0)
+    actuated = held(actuated, half)
     spread = np.ones(2 * _CONTACT * half + 1)
     free = np.convolve(~free, spread, mode="same") < 0.5
     free[: 2 * half] = free[len(free) - 2 * half :] = False
-    needed, bias, speed = (correlate1d(each, window, axis=0) for each in (needed, bias, qvel))
+    needed, bias, speed = (_averaged(each, half) for each in (needed, bias, qvel))
     return Dynamics(record, log, (needed, actuated, bias, speed), free)
+
+
+def held(actions: Array, half: int) -> Array:
+    """Return actions, or their forces, averaged over windows.
+
+    An action holds until the next row, so what acts around a row began half a step before.
+    """
+    return _averaged((actions + np.roll(actions, 1, axis=0)) / 2, half)
+
+
+def _averaged(values: Array, half: int) -> Array:
+    return correlate1d(values, np.ones(2 * half + 1) / (2 * half + 1), axis=0)
 
 
 def fit_terms(terms: Terms, *, half: int) -> Fit | None:
