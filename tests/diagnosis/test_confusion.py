@@ -74,3 +74,9 @@ def test_a_part_of_the_best_model_is_no_rival_of_it():
     part = model(1.0, "dead_band")
     found = Selection(model(11.0), best, (), (), (part,), {"action_delay": (part,)})
     assert confusion_set(found, "action_delay") == ("action_delay",)
+
+
+def test_a_part_of_the_best_model_is_no_rival_where_something_is_left():
+    best = model(1.0, "action_delay")
+    found = selection(best, model(1.01, "action_delay"), p_values=(1e-9, 0.001))
+    assert confusion_set(found, "action_delay") == ("action_delay",)

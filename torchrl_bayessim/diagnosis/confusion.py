@@ -40,7 +40,7 @@ def confusion_set(selection: Selection, name: str) -> tuple[str, ...]:
     if len(own) == 1 and min(selection.p_values[1:], default=1.0) < _MISSING:
         others += [
             stand_in(selection, rival)
-            for rival in selection.alternatives.get(name, ())
+            for rival in _others(selection, name)
             if _short(selection, rival) < _OTHER
         ]
     if len(own) > 1:
@@ -105,10 +105,15 @@ def rivals(selection: Selection, name: str, *, form: float = _LAST) -> list[Mode
     """
     return [
         m
-        for m in selection.alternatives.get(name, ())
-        if not set(m.units) <= set(selection.best.units)
+        for m in _others(selection, name)
         if as_good(selection.best, m) or _another_form(selection, m, name, form=form)
     ]
+
+
+def _others(selection: Selection, name: str) -> list[Model]:
+    """Return the models with another effect in the place of one, and not less than it alone."""
+    best = set(selection.best.units)
+    return [m for m in selection.alternatives.get(name, ()) if not set(m.units) <= best]
 
 
 def _another_form(selection: Selection, rival: Model, name: str, *, form: float) -> bool:
