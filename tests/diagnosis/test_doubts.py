@@ -15,6 +15,8 @@ from torchrl_bayessim.diagnosis.divergence import diverges_throughout
 from torchrl_bayessim.diagnosis.doubts import doubts
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.report import Finding
+from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
+from torchrl_bayessim.diagnosis.verdict import _Weighed
 from torchrl_bayessim.effects.catalogue import effect as catalogued
 from torchrl_bayessim.effects.robot import robot_of
 from torchrl_bayessim.envs.task import Task
@@ -61,6 +63,21 @@ def test_a_cause_whose_interval_holds_zero_is_none(monkeypatch):
     assert report.verdict == "unknown"
     assert not report.effects
     assert "what could explain it on some runs does not hold up" in report.summary
+
+
+@pytest.mark.parametrize(("low", "verdict"), [(0.5, "named"), (-0.35, "named_partial")])
+def test_a_share_that_may_be_nothing_is_named_with_reserve(low, verdict):
+    measured = Shrinkage(9.0, 3.0, 1.0, 1.0, (low, 1.0), (1.0, 4.0), (0.0, 0.1))
+    weighed = _Weighed(
+        measured,
+        significant=True,
+        certain=True,
+        visible=True,
+        validated=0.9,
+        unsaid=False,
+        elsewhere=False,
+    )
+    assert weighed.named(ambiguous=False) == verdict
 
 
 @pytest.mark.parametrize(

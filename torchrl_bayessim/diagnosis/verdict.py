@@ -171,7 +171,8 @@ class _Weighed:
         # of a large gap, 2 % may be ten times the noise: proof that the law is another one
         nearly_all = measured.explained >= _ALL and measured.effects <= _NOISE_AGAIN
         left = measured.remainder_ci[0] > _NEGLIGIBLE and not nearly_all
-        return "named" if measured.explained >= NAMED and not left else "named_partial"
+        borne_out = measured.explained >= NAMED and measured.explained_ci[0] > 0
+        return "named" if borne_out and not left else "named_partial"
 
 
 def _obstacle(system: System, prepared: Prepared, *, diverges: bool) -> tuple[str, str] | None:
