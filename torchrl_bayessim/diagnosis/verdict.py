@@ -116,7 +116,7 @@ class _Weighed:
 
     Attributes:
         measured: How far the gap shrinks on test runs.
-        significant: Whether the search, or chance, found something.
+        significant: Whether the search found something.
         certain: Whether noise alone would never do this.
         visible: Whether the gap can be seen without a cause.
         validated: Share of the gap that is explained on validation runs.
@@ -150,11 +150,14 @@ class _Weighed:
         shown = least > _UNEXPLAINED or (measured.refit > SHOWN and p_value < SURE)
         shown |= lowest > SHOWN and max(others) > _UNEXPLAINED
         visible = least > _PLAIN or (lowest > 1.0 and shown)
-        validated = share_on_validation(selection) if effects else 0.0
-        perhaps_nothing = measured.explained_ci[0] <= 0 and validated < PARTIAL and not scattered
+        # what was found in the place of effects is judged without them
+        validated = share_on_validation(selection) if effects and not scattered else 0.0
+        # losses explain what they spoil, or are something else
+        surely = PARTIAL if scattered else 0.0
+        perhaps_nothing = measured.explained_ci[0] <= surely and validated < PARTIAL
         unsaid = measured.explained < PARTIAL or perhaps_nothing
         elsewhere = unsaid and hardly_shown(measured) and validated >= enough(p_value)
-        significant = p_value <= alpha or bool(scattered)
+        significant = p_value <= alpha and bool(selection.best.units) and not scattered
         return cls(measured, significant, certain, visible, validated, unsaid, elsewhere)
 
     def named(self, *, ambiguous: bool) -> Verdict:
