@@ -54,15 +54,23 @@ def test_commands_that_never_change_name_nothing_without_reserve():
         assert any("no command ever changes" in alarm for alarm in report.alarms)
 
 
-def test_a_cause_whose_interval_holds_zero_is_none(monkeypatch):
+@pytest.mark.parametrize("at_the_end", [True, False])
+def test_a_cause_that_may_be_nothing_at_the_end_of_its_range_is_none(monkeypatch, at_the_end):
+    where = "torchrl_bayessim.diagnosis"
+    if at_the_end:
+        monkeypatch.setattr(f"{where}.doubts._EDGE", 0.01)
     monkeypatch.setattr(
-        "torchrl_bayessim.diagnosis.assembly.strength_errors",
+        f"{where}.assembly.strength_errors",
         lambda fit, *_: dict.fromkeys(fit.units, 1.0),  # N m, of 0.15
     )
     report = diagnose(system(), None, logs(push=friction), effects=["coulomb_friction"])
-    assert report.verdict == "unknown"
-    assert not report.effects
-    assert "what could explain it on some runs does not hold up" in report.summary
+    if at_the_end:
+        assert report.verdict == "unknown"
+        assert not report.effects
+        assert "what could explain it on some runs does not hold up" in report.summary
+    else:
+        assert report.verdict == "named_partial"
+        assert any("may be nothing: its interval" in alarm for alarm in report.alarms)
 
 
 @pytest.mark.parametrize(("low", "verdict"), [(0.5, "named"), (-0.35, "named_partial")])

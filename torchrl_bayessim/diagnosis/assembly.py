@@ -22,7 +22,7 @@ from .candidates import candidates, strength_errors
 from .confusion import confusion_set, settled
 from .credit import apart, credit_of, unit_credit
 from .divergence import divergence_alarms, diverges_throughout
-from .doubts import doubts
+from .doubts import baseless, doubts
 from .experiment import experiments
 from .figures import figures
 from .location import location
@@ -81,6 +81,7 @@ def assemble(
     parameters = _parameters(system, prepared, selection)
     where, remainder = _locations(prepared, selection, credit)
     rollouts = rollout_errors(prepared, points)
+    units = _every_unit(selection, scatter)
     odd = odd_runs(prepared.sets, prepared.logs, best.fit.point)
     verdict, summary, more = conclude(
         system,
@@ -94,7 +95,8 @@ def assemble(
         where=where,
         diverges=diverges_throughout(rollouts),
         odd=odd,
-        doubts=doubts(found.effects, _every_unit(selection, scatter), prepared),
+        baseless=all(baseless(effect, units) for effect in found.effects),
+        doubts=doubts(found.effects, units, prepared),
         alpha=alpha,
     )
     if verdict in {"none", "unknown", "not_testable"}:

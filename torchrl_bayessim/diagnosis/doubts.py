@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["doubts"]
+__all__ = ["baseless", "doubts"]
 
 from collections.abc import Sequence
 
@@ -13,6 +13,7 @@ from .preparation import Prepared
 from .report import Finding
 
 _EDGE = 0.98  # of the largest strength that is looked for
+_ANYTHING = -np.inf, np.inf
 
 
 def doubts(effects: Sequence[Finding], units: Sequence[Unit], prepared: Prepared) -> list[str]:
@@ -28,8 +29,7 @@ def doubts(effects: Sequence[Finding], units: Sequence[Unit], prepared: Prepared
     """
     if not effects:
         return []
-    ends = {(u.name, u.where): (u.actual(u.low), u.actual(u.high)) for u in units}
-    found = [text for effect in effects for text in _of_strength(effect, ends)]
+    found = [text for effect in effects for text in _of_strength(effect, _ends(units))]
     commands = [o.segments.ctrl for o in prepared.sets.values()]
     least, most = (np.array([f(one, axis=(0, 1)) for one in commands]) for f in (np.min, np.max))
     if least.size and (least.min(0) == most.max(0)).all():
@@ -39,12 +39,33 @@ def doubts(effects: Sequence[Finding], units: Sequence[Unit], prepared: Prepared
     return found
 
 
+def baseless(effect: Finding, units: Sequence[Unit]) -> bool:
+    """Return whether an effect may be nothing, and is at the end of what was looked for as well.
+
+    A wide interval alone may be that of a law without slope, such as a play that is all taken up.
+    """
+    low, high = effect.ci95
+    return low <= 0 <= high and all(
+        _at_end(strength, _ends(units).get((effect.name, place), _ANYTHING))
+        for place, strength in effect.strengths.items()
+    )
+
+
+def _ends(units: Sequence[Unit]) -> dict[tuple[str, str], tuple[float, float]]:
+    return {(u.name, u.where): (u.actual(u.low), u.actual(u.high)) for u in units}
+
+
+def _at_end(strength: float, ends: tuple[float, float]) -> bool:
+    low, high = ends
+    return not (_EDGE * low if low < 0 else -np.inf) < strength < _EDGE * high
+
+
 def _of_strength(effect: Finding, ends: dict[tuple[str, str], tuple[float, float]]) -> list[str]:
     name, unit = effect.name.replace("_", " "), effect.unit
     texts = []
     for place, strength in effect.strengths.items():
-        low, high = ends.get((effect.name, place), (-np.inf, np.inf))
-        if not (_EDGE * low if low < 0 else -np.inf) < strength < _EDGE * high:
+        low, high = ends.get((effect.name, place), _ANYTHING)
+        if _at_end(strength, (low, high)):
             texts.append(
                 f"{name} at {place} was fitted to {strength:.3g} {unit}, the end of what is looked "
                 f"for, [{low:.3g}, {high:.3g}]: there is more of it, or it stands for another cause"

@@ -54,6 +54,7 @@ def conclude(
     where: Mapping[str, Any],
     diverges: bool,
     odd: Collection[str],
+    baseless: bool,
     doubts: Sequence[str],
     alpha: float,
 ) -> tuple[Verdict, str, list[str]]:
@@ -71,6 +72,7 @@ def conclude(
         where: The error's place.
         diverges: Whether the simulator lives through no whole run.
         odd: Runs that depart from the simulator, even with the effects, as no other does.
+        baseless: Whether no effect was found that the data bear out.
         doubts: Why nothing should be named without reserve.
         alpha: Level of the tests.
     """
@@ -79,8 +81,7 @@ def conclude(
     verdict: Verdict
     if obstacle is not None:
         verdict = "not_testable"
-    elif all(low <= 0.0 <= high for low, high in (effect.ci95 for effect in effects)):
-        # nothing was found, or nothing that the data bear out
+    elif baseless:  # nothing was found, or nothing that the data bear out
         verdict = "unknown" if weighed.visible else "none"
     else:
         groups = {u.effect.group for u in selection.best.units if u.name in confused[:1]}
@@ -116,7 +117,7 @@ class _Weighed:
 
     Attributes:
         measured: How far the gap shrinks on test runs.
-        significant: Whether the search found something.
+        significant: Whether the search, or chance, found something.
         certain: Whether noise alone would never do this.
         visible: Whether the gap can be seen without a cause.
         validated: Share of the gap that is explained on validation runs.
@@ -150,14 +151,11 @@ class _Weighed:
         shown = least > _UNEXPLAINED or (measured.refit > SHOWN and p_value < SURE)
         shown |= lowest > SHOWN and max(others) > _UNEXPLAINED
         visible = least > _PLAIN or (lowest > 1.0 and shown)
-        # what was found in the place of effects is judged without them
-        validated = share_on_validation(selection) if effects and not scattered else 0.0
-        # losses explain what they spoil, or are something else
-        surely = PARTIAL if scattered else 0.0
-        perhaps_nothing = measured.explained_ci[0] <= surely and validated < PARTIAL
+        validated = share_on_validation(selection) if effects else 0.0
+        perhaps_nothing = measured.explained_ci[0] <= 0 and validated < PARTIAL and not scattered
         unsaid = measured.explained < PARTIAL or perhaps_nothing
         elsewhere = unsaid and hardly_shown(measured) and validated >= enough(p_value)
-        significant = p_value <= alpha and bool(selection.best.units) and not scattered
+        significant = p_value <= alpha or bool(scattered)
         return cls(measured, significant, certain, visible, validated, unsaid, elsewhere)
 
     def named(self, *, ambiguous: bool) -> Verdict:
