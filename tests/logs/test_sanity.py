@@ -518,18 +518,6 @@ def test_a_push_is_found_and_friction_is_not_a_push():
     assert all(140 <= f.rows[0] <= f.rows[1] <= 170 for f in found)
 
 
-@pytest.mark.parametrize("seed", [3, 4])
-def test_a_push_is_told_from_a_fast_swing(seed):
-    """Whose forces change within the windows over which they are averaged."""
-    system, records = simulated("swing", seed=seed)
-    assert not kinds(check(records, system))
-    pushed = _pushed_arm(rows=range(150, 160), force=40.0, model=system.task.model)
-    found = [f for f in check([pushed, *records], system) if f.kind == "push"]
-    assert {f.file for f in found} == {"pushed.csv"}
-    assert found[0].rows[0] < 160
-    assert found[0].rows[1] > 150
-
-
 def _pushed_arm(*, rows, force, model=None):
     model = model or SYSTEMS["arm"][0]().model
     data = mujoco.MjData(model)

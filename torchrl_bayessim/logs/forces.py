@@ -2,9 +2,9 @@ r"""Do logged actions push the way that joints accelerate, and does nothing else
 
 A factor :math:`\gamma` of the actuators far from 1 (see `inverse_dynamics`) means an action of
 another sign or unit, and only a force that no actuator could exert stands out of the rest. Where
-the regression is uncertain, nothing is found. What actuators could exert all logs tell together: in
-one they may hardly be used. A log whose actions are in another order is named by `swaps`, one whose
-motion or actions are in other units than in the rest by `units`, and says nothing here.
+the regression is uncertain, nothing is found. A log whose actions are in another order is named by
+`swaps`, one whose motion or actions are in other units than in the rest by `units`, and says
+nothing here.
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ def check_forces(
         if not fits:
             continue
         spread = float(np.median([fit.spread for *_, fit in fits]))
-        largest = 2 * max(float(np.abs(terms[1]).max()) for _, _, terms, *_ in fits)
         found = []
-        for record, log, _, free, fit in fits:
+        for record, log, terms, free, fit in fits:
+            largest = 2 * float(np.abs(terms[1]).max())
             stretches = _pushed(fit.residual, largest, spread, free=free)
             found += [_push(record, log, name, rows=rows) for rows in stretches]
         if len({f.file for f in found}) <= max(1, len(records) // 4):

@@ -1,13 +1,13 @@
 r"""What force the motion of a log takes, and what its actuators exert in the model.
 
-The generalised force that the motion takes, :math:`y = M(q)\,\ddot q + c(q, \dot q)`, is compared
-with what actuators exert in the model, :math:`\tau`, by robust regression at each actuated joint,
+Over windows of a tenth of a second, the generalised force that the motion takes,
+:math:`y = M(q)\,\ddot q + c(q, \dot q)`, is compared with what actuators exert in the model,
+:math:`\tau`, by robust regression at each actuated joint,
 
 .. math:: y = \gamma\,\tau + \beta\,c + f\,\operatorname{sgn}\dot q + b\,\dot q + o .
 
-All terms are means over windows of a tenth of a second: of forces row by row, because the inertia
-and the velocities of a fast arm change within a window. The terms besides :math:`\tau` take up what
-parameters and friction may differ by. Rows near contacts or limits say nothing and are left out.
+The terms besides :math:`\tau` take up what parameters and friction may differ by. Rows near
+contacts or limits say nothing and are left out.
 """
 
 from __future__ import annotations
@@ -83,7 +83,9 @@ def actuated_joints(model: mujoco.MjModel) -> list[tuple[int, int]]:
 def dynamics(model: mujoco.MjModel, record: Record, log: Log, half: int) -> Dynamics:
     """Return the forces of a log, averaged over windows of ``2 half + 1`` rows."""
     qpos, qvel, ctrl = log.qpos.numpy(), log.qvel.numpy(), log.ctrl.numpy()
-    rate = np.gradient(qvel, log.time.numpy(), axis=0)
+    dt = float(log.time[1] - log.time[0])
+    offset = dt * np.arange(-half, half + 1)
+    slope = correlate1d(qvel, offset / (offset**2).sum(), axis=0)
     data = mujoco.MjData(model)
     needed, actuated, bias = (np.zeros((len(log), model.nv)) for _ in range(3))
     free = np.ones(len(log), dtype=bool)
@@ -94,13 +96,13 @@ def dynamics(model: mujoco.MjModel, record: Record, log: Log, half: int) -> Dyna
             mujoco.mj_forward(model, data)
             actuated[t], bias[t] = data.qfrc_actuator, data.qfrc_bias
             free[t] = data.ncon == 0 and not barred & set(data.efc_type.tolist())
-            mujoco.mj_mulM(model, data, needed[t], rate[t])
+            mujoco.mj_mulM(model, data, needed[t], slope[t])
             needed[t] += data.qfrc_bias
     actuated = held(actuated, half)
     spread = np.ones(2 * _CONTACT * half + 1)
     free = np.convolve(~free, spread, mode="same") < 0.5
     free[: 2 * half] = free[len(free) - 2 * half :] = False
-    needed, bias, speed = (_averaged(each, half) for each in (needed, bias, qvel))
+    bias, speed = (_averaged(each, half) for each in (bias, qvel))
     return Dynamics(record, log, (needed, actuated, bias, speed), free)
 
 
