@@ -21,8 +21,8 @@ import mujoco
 import numpy as np
 import torch
 from arm import ARM
+from log_columns import by_columns
 from measuring import options, report
-from tensordict import TensorDict
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.envs.task import Task
@@ -80,21 +80,10 @@ def recorded(
             data.ctrl[:] = command
             mujoco.mj_step(robot, data, task.frame_skip)
         state += rng.standard_normal(state.shape) * np.repeat(NOISE, (robot.nq, robot.nv))
-        logs += read_logs(_named(system, t[:, 0], state, commands), system)
+        table = by_columns(system, torch.from_numpy(state), torch.from_numpy(commands))
+        table[system.columns.time or "time"] = torch.from_numpy(t[:, 0].copy())
+        logs += read_logs(table, system)
     return logs
-
-
-def _named(system: System, t: np.ndarray, state: np.ndarray, commands: np.ndarray) -> TensorDict:
-    """Return a trajectory by the columns of the system; all its joints have one coordinate."""
-    columns, model = system.columns, system.task.model
-    table = {columns.time or "time": t}
-    for joint, names in columns.qpos.items():
-        table[names[0]] = state[:, model.joint(joint).qposadr[0]]
-    for joint, names in columns.qvel.items():
-        table[names[0]] = state[:, model.nq + model.joint(joint).dofadr[0]]
-    for column, name in enumerate(columns.ctrl.values()):  # in the order of the actuators
-        table[name] = commands[:, column]
-    return TensorDict({name: torch.from_numpy(v.copy()) for name, v in table.items()}, [len(t)])
 
 
 def with_friction(system: System, name: str) -> mujoco.MjModel:

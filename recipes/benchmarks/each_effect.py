@@ -35,8 +35,9 @@ import mujoco
 import numpy as np
 import torch
 from arm import TWO_LINKS
+from log_columns import by_columns
 from measuring import options
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
@@ -113,7 +114,7 @@ def recorded(
     noise = torch.tensor(NOISE).repeat_interleave(system.task.model.nv)
     observation = seen["observation"]
     white = torch.randn(observation.shape, generator=generator(seed, "noise"))
-    return read_logs(named(system, observation + noise * white, seen["action"]), system)
+    return read_logs(by_columns(system, observation + noise * white, seen["action"]), system)
 
 
 def commands(system: System, amplitude: float, *, seed: int) -> torch.Tensor:
@@ -122,15 +123,6 @@ def commands(system: System, amplitude: float, *, seed: int) -> torch.Tensor:
     rng = np.random.default_rng(seed)
     kinds = excitations(-reach, reach, steps=STEPS, dt=system.control_dt, generator=rng)
     return torch.from_numpy(np.stack([*kinds.values()][:RUNS])).float()
-
-
-def named(system: System, observation: torch.Tensor, actions: torch.Tensor) -> TensorDict:
-    """Return runs by the columns of the system, all of whose joints have one coordinate."""
-    columns = system.columns
-    order = [*columns.qpos.values(), *columns.qvel.values()]
-    table = {name[0]: observation[..., i].double() for i, name in enumerate(order)}
-    table |= {name: actions[..., i].double() for i, name in enumerate(columns.ctrl.values())}
-    return TensorDict(table, actions.shape[:2])
 
 
 def cases(
