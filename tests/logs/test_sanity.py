@@ -518,13 +518,13 @@ def test_a_push_is_found_and_friction_is_not_a_push():
     assert all(140 <= f.rows[0] <= f.rows[1] <= 170 for f in found)
 
 
-def _pushed_arm(*, rows, force, model=None):
-    model = model or SYSTEMS["arm"][0]().model
+def _pushed_arm(*, rows, force):
+    model = SYSTEMS["arm"][0]().model
     data = mujoco.MjData(model)
     rng = np.random.default_rng(3)
     columns = {"time": [], "qpos": [], "qvel": [], "ctrl": []}
     for t in range(300):
-        data.ctrl[:] = rng.uniform(-0.8, 0.8, model.nu) if t % 10 == 0 else data.ctrl
+        data.ctrl[:] = rng.uniform(-0.8, 0.8, 2) if t % 10 == 0 else data.ctrl
         data.qfrc_applied[0] = force if t in rows else 0.0
         for name, column in columns.items():
             column.append(np.copy(getattr(data, name)))

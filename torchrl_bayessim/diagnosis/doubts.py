@@ -44,9 +44,9 @@ def baseless(effect: Finding, units: Sequence[Unit]) -> bool:
 
     A wide interval alone may be that of a law without slope, such as a play that is all taken up.
     """
-    low, high = effect.ci95
+    (low, high), ends = effect.ci95, _ends(units)
     return low <= 0 <= high and all(
-        _at_end(strength, _ends(units).get((effect.name, place), _ANYTHING))
+        _at_end(strength, ends.get((effect.name, place), _ANYTHING))
         for place, strength in effect.strengths.items()
     )
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..logs.log import Log
 from .objective import Objective, Point
+from .shrinkage import squares
 
 _ODD = 4.0  # times the error of a usual run, and times the noise
 
@@ -29,12 +30,10 @@ def odd_runs(
     """
     means = {}
     for name, objective in sets.items():
-        innovations = objective([point])[0]
-        squares = (innovations**2).sum(-1)
-        size = objective.whitening.weights**2 * innovations.shape[-1]
-        for i in np.unique(objective.segments.log):
-            here = objective.segments.log == i
-            means[logs[name][i].name] = float(squares[here].sum() / size[here].sum())
+        groups = objective.segments.log
+        sums, sizes = squares(objective, [point], groups)
+        for i, each, size in zip(np.unique(groups), sums, sizes, strict=True):
+            means[logs[name][i].name] = float(each / size)
     if len(means) < 3:
         return {}
     usual = max(float(np.median([*means.values()])), 1.0)

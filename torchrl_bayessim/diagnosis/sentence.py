@@ -64,8 +64,6 @@ def sentence(
         return f"{_no_gap(measured.refit)}{ruled_out}{untested}"
     if verdict == "not_testable":
         return f"These data cannot say: {hint}.{untested}"
-    rules = where["regimes"]
-    f" It sits at {rules[0]['rule']}." if rules and _much(rules[0]) else ""
     if verdict == "unknown":
         real = _unknown(measured, candidates, odd, where["regimes"])
         return f"{gap} It is real, {real}{parameters}{untested}"

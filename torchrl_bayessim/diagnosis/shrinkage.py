@@ -7,7 +7,7 @@ the parameters alone gains is the parameters' credit.
 
 from __future__ import annotations
 
-__all__ = ["Shrinkage", "shrinkage"]
+__all__ = ["Shrinkage", "shrinkage", "squares"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -102,11 +102,27 @@ def shrinkage(
 
 def _sums(objective: Objective, points: Sequence[Point], floor: float) -> Array:
     """Return squares of the three points and their number, summed over units to resample."""
-    innovations = objective(points)
-    size = floor * objective.whitening.weights**2 * innovations.shape[2]
     groups = objective.segments.log
     if len(np.unique(groups)) < _LOGS:
-        groups = np.arange(len(size))
+        groups = np.arange(len(groups))
+    sums = squares(objective, points, groups)
+    sums[-1] *= floor
+    return sums
+
+
+def squares(objective: Objective, points: Sequence[Point], groups: NDArray[np.int64]) -> Array:
+    """Return sums of squared innovations, and of how many they count as, over groups of segments.
+
+    Args:
+        objective: Of the segments.
+        points: ``P`` of them.
+        groups: Of each segment, shape ``(S,)``.
+
+    Returns:
+        Shape ``(P + 1, G)``: one row per point and the number, groups in ascending order.
+    """
+    innovations = objective(points)
+    size = objective.whitening.weights**2 * innovations.shape[2]
     names, index = np.unique(groups, return_inverse=True)
     per = (*(innovations**2).sum(-1), size)
     return np.array([np.bincount(index, one, len(names)) for one in per], dtype=np.float64)
