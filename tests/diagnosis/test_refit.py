@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from torchrl_bayessim.diagnosis.objective import Point, Unit
-from torchrl_bayessim.diagnosis.refit import refit
+from torchrl_bayessim.diagnosis.objective import Objective, Point, Unit
+from torchrl_bayessim.diagnosis.refit import refit, with_width
 from torchrl_bayessim.effects.action import ActionBias
 from torchrl_bayessim.effects.joints import CoulombFriction
 
@@ -15,7 +15,7 @@ WRONG = Unit(ActionBias(), "motor", (1.0,), -1.0, 1.0)
 class Bends:
     """40 innovations that the right unit explains, and the wrong one hardly, along a curve."""
 
-    size, prior = 1, None
+    size, prior, width = 1, None, 0.01
 
     def __init__(self):
         self.evaluations = {RIGHT: 0, WRONG: 0}
@@ -53,3 +53,35 @@ def test_a_known_cost_may_be_what_a_fit_is_behind():
     refit(alone, STARTS[1:])
     refit(raced, STARTS[1:], race=0.0)
     assert raced.evaluations[WRONG] < alone.evaluations[WRONG]
+
+
+class Rough(Objective):
+    """60 innovations that one parameter explains, with a ripple or without."""
+
+    def __init__(self, ripple, coordinates=2):
+        self.ripple, self.prior, self.coordinates = ripple, None, coordinates
+
+    @property
+    def size(self):
+        return self.coordinates
+
+    def __call__(self, points, offsets=None):
+        z = np.array([point.z[0] for point in points])[:, None]
+        rows = np.arange(60.0)
+        left = 0.5 * (z - 1.5) * (1 + rows / 60) + self.ripple * np.sin(400 * z + rows**2)
+        return left[:, None]
+
+
+def test_derivatives_are_wide_where_residuals_are_rough():
+    start = Point(np.zeros(2))
+    rough, smooth = Rough(0.05), Rough(0.0)
+    assert with_width(smooth, start) is smooth
+    wide = with_width(rough, start)
+    assert wide.width > rough.width
+    exact = refit(smooth, [start])[0].point.z[0]
+    assert refit(wide, [start])[0].point.z[0] == pytest.approx(exact, abs=0.05)
+
+
+def test_without_parameters_derivatives_stay_narrow():
+    objective = Rough(0.05, coordinates=1)
+    assert with_width(objective, Point(np.zeros(1))) is objective

@@ -111,6 +111,7 @@ def explanations(train: Objective, now: Round) -> list[Fit]:
     for point in starts:
         on = [unit for unit in point.strengths if unit not in base.units]
         near = np.abs(point.z - base.point.z).max() < _NEAR
+        near &= set(base.units) <= set(point.strengths)  # unless spread over their targets
         known.append(now.seen.origin(base, on) if near else None)
     tried = refit(train, starts, origins=known, iterations=2, renew=False)
     best = _fittest(tried, _FINALISTS, alike=1)

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-_STEP = 0.01  # of a prior standard deviation, and of an effect's range
 _CAREFUL = (3.0, 100.0)  # dampings tried after a step that failed, times the one before
 _FULL = 1e-3  # damping of a step that is hardly damped
 _RANGE = (_FULL, 0.1, 1.0, 10.0)  # dampings of steps that may promise something
@@ -38,6 +37,7 @@ class LevenbergMarquardt:
         origin: A point, ``r`` there and its Jacobian ``(m, n)``, from which the beginning is the
             first step; without it derivatives are made at the beginning.
         renew: Whether derivatives are made anew where the updated ones fail, and before it stops.
+        width: Step of derivatives.
 
     Attributes:
         vector: The best point so far.
@@ -56,10 +56,11 @@ class LevenbergMarquardt:
         size: int,
         origin: tuple[Array, Array, Array] | None = None,
         renew: bool = True,
+        width: float = 0.01,
     ) -> None:
         self._low, self._high = bounds
         self.vector = np.clip(vector, *bounds)
-        self._size, self._renew = size, renew
+        self._size, self._renew, self._width = size, renew, width
         self._damping, self._factors = _FULL, (1.0,)
         self._asked: list[Array] = []
         self._origin = origin
@@ -100,7 +101,7 @@ class LevenbergMarquardt:
         return points
 
     def _step(self, d: int) -> float:
-        return -_STEP if self.vector[d] + _STEP > self._high[d] else _STEP
+        return -self._width if self.vector[d] + self._width > self._high[d] else self._width
 
     def _begin(self, residuals: Sequence[Array]) -> None:
         self.residual, self.cost = residuals[0], self._price(residuals[0], self.vector)

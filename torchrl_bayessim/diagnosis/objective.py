@@ -143,9 +143,11 @@ class Objective:
 
     Attributes:
         located: Whether each residual belongs to a row of its segment.
+        width: Step of derivatives, of a prior standard deviation and of an effect's range.
     """
 
     located = True
+    width = 0.01
 
     def __init__(
         self, predictor: Predictor, prior: Prior | None, segments: Segments, whitening: Whitening
@@ -169,6 +171,10 @@ class Objective:
     def on(self, predictor: Predictor) -> Objective:
         """Return the same with another simulator."""
         return self._but(predictor=predictor)
+
+    def differing(self, width: float) -> Objective:
+        """Return the same with another step of derivatives."""
+        return self._but(width=width)
 
     def weighted(self, point: Point) -> Objective:
         """Return the same with the robust weights that the segments deserve at a point."""
