@@ -6,11 +6,13 @@ would do as well beside the effects that were found since, is fitted here.
 
 from __future__ import annotations
 
-__all__ = ["alternatives", "exchanged"]
+__all__ = ["alternatives", "exchanged", "kind"]
 
 from collections.abc import Mapping, Sequence
 
+from ..effects.contacts import ContactFriction
 from ..effects.effect import Effect
+from ..effects.joints import CoulombFriction
 from .explanations import compare
 from .model import LIKELY, Model, criterion, gain, judged, needed
 from .objective import Objective, Point, Unit
@@ -43,20 +45,46 @@ def alternatives(
             strongest, most = compare(train, base.fit, left).seen.best(1.0), _RIVALS
         else:  # the search has tried those that stand out; what acts alike is a rival anyway
             base, most = start, _ALIKE
-            groups = {u.effect.group for u in best.units}
+            groups = {kind(u.effect) for u in best.units}
             seen = {u.effect for m in known for u in m.units}
             strongest = {
                 unit: found
                 for unit, found in first.best(1.0).items()
-                if unit.effect.group in groups and unit.name != name and unit.effect not in seen
+                if kind(unit.effect) in groups and unit.name != name and unit.effect not in seen
             }
         additions: dict[Effect, dict[Unit, float]] = {}
         for unit, (_, strength) in strongest.items():
             if len(additions) < most:
                 additions.setdefault(unit.effect, {unit: strength})
         known += _fitted(train, validation, base, list(additions.values()), race=best.fit.cost)
+        if train.width > Objective.width:
+            known += _nearer((train, validation), best, name, known)
         result[name] = tuple(known)
     return result
+
+
+def _nearer(
+    sets: tuple[Objective, Objective], best: Model, name: str, known: Sequence[Model]
+) -> list[Model]:
+    """Return what acts alike fitted once more, from the parameters of the best model.
+
+    Where residuals are rough, a fit from afar ends anywhere: with what it had, and twice as much.
+    """
+    mine = {kind(unit.effect) for unit in best.units if unit.name == name}
+    starts = []
+    for model in known:
+        added = [unit for unit in model.units if unit not in best.units]
+        if {kind(unit.effect) for unit in added} == mine:
+            strengths = model.fit.point.strengths
+            for times in (1.0, 2.0):
+                more = {u: u.inside(times * strengths[u]) for u in added}
+                starts.append(Point(best.fit.point.z, {**strengths, **more}))
+    return judged(*sets, refit(sets[0], starts)) if starts else []
+
+
+def kind(effect: Effect) -> str:
+    """Return what an effect acts like: its group; friction does alike in joints and in contacts."""
+    return CoulombFriction.group if isinstance(effect, ContactFriction) else effect.group
 
 
 def _stands_in(model: Model, kept: dict[Unit, float], name: str) -> bool:

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 from ..effects.effect import Effect
 from ..effects.transmission import ServoDeadBand
+from .alternatives import kind
 from .model import Model, as_good
 from .objective import Objective
 from .selection import Selection, parts
@@ -16,6 +17,7 @@ from .selection import Selection, parts
 _SAME = 2.0  # of a deviance: what fits of one and the same law may differ by
 _LAST = 0.01  # of what an effect explains: too little to prefer one law to another
 _FORM = 0.1  # of the same: how well the form of a law is known
+_ELSEWHERE = 0.25  # of the same, by friction in contacts: chattering ones no fit follows exactly
 _OTHER = 0.03  # of the same, by a law of another kind, where the best is not the true one
 _MISSING = 0.01  # p-value of what a law leaves if it is the true one
 
@@ -65,12 +67,12 @@ def _alike_alone(selection: Selection, name: str) -> list[str]:
 def _alike_beside(selection: Selection, name: str) -> list[str]:
     """Return what acts like an effect and, beside it, explains much that it leaves."""
     best = selection.best
-    groups = {unit.effect.group for unit in best.units if unit.name == name}
+    groups = {kind(unit.effect) for unit in best.units if unit.name == name}
     found = []
     for model in selection.tried:
         added = [unit for unit in model.units if unit not in best.units]
         beside = len(model.units) == len(best.units) + len(added)
-        if beside and {unit.effect.group for unit in added} == groups:
+        if beside and {kind(unit.effect) for unit in added} == groups:
             less = float((best.deviances() - model.deviances()).sum())
             if less > _FORM * _explained(selection):
                 found += [unit.name for unit in added]
@@ -87,7 +89,7 @@ def _alike(one: Effect, other: Effect) -> bool:
 
     A servo that ignores small errors stands still, as if there were stiction.
     """
-    groups = {one.group, other.group}
+    groups = {kind(one), kind(other)}
     servo = isinstance(one, ServoDeadBand) or isinstance(other, ServoDeadBand)
     return len(groups) == 1 or (servo and "friction" in groups)
 
@@ -119,9 +121,11 @@ def _others(selection: Selection, name: str) -> list[Model]:
 def _another_form(selection: Selection, rival: Model, name: str, *, form: float) -> bool:
     """Return whether a rival of the same group explains nearly all of the same."""
     best = selection.best
-    mine = {u.effect.group for u in best.units if u.name == name}
-    others = {u.effect.group for u in rival.units if u not in best.units}
-    return mine == others and _short(selection, rival) < form
+    mine = {kind(u.effect) for u in best.units if u.name == name}
+    others = {kind(u.effect) for u in rival.units if u not in best.units}
+    groups = {u.effect.group for u in (*best.units, *rival.units) if kind(u.effect) in mine}
+    least = form if len(groups) == 1 else max(form, _ELSEWHERE)
+    return mine == others and _short(selection, rival) < least
 
 
 def _short(selection: Selection, rival: Model) -> float:
