@@ -25,7 +25,7 @@ from ..errors import message
 from ..logs.log import Log
 from .prediction import Predictor
 from .segments import Segments
-from .smoother import Beliefs, Filtered, filtered, smoothed
+from .smoother import Beliefs, Filtered, filtered, likeliest_share, smoothed, unknown_forces
 
 Array = NDArray[np.float64]
 _POSITION, _VELOCITY = 0.1, 0.5  # rad or m, and per second: a guess that is good
@@ -34,7 +34,6 @@ _WIDEST = {int(mujoco.mjtJoint.mjJNT_HINGE): np.pi, int(mujoco.mjtJoint.mjJNT_SL
 _HYPOTHESES = 8  # of where the hidden joints were
 _CLOSE = 0.4  # of the range of hypotheses: how far from the truth the nearest may be
 _TRIAL = 80  # rows after which the likeliest hypothesis is kept
-_FORCES = (1e-3, 3e-3, 1e-2, 3e-2, 1e-1)  # of the largest force of a joint, in one second
 _CURVED = 0.5  # ratio of second to first differences
 _USUAL = 1e-2  # while hypotheses are compared
 
@@ -80,7 +79,7 @@ class Hidden:
         Raises:
             ValueError: Simulations along a log diverge.
         """
-        unit = _unknown_forces(predictor)
+        unit = unknown_forces(predictor)
 
         def run(some: Sequence[Log], first: Beliefs, shares: Any, **kept: Any) -> Filtered:
             forces = np.array(shares)[:, None, None] ** 2 * unit
@@ -93,11 +92,8 @@ class Hidden:
         found = run(several, _joined(starts), [_USUAL] * len(several), **trial)
         likeliest = found.likelihood.reshape(len(logs), -1).argmax(1)
         first = _joined([_one(some, i) for some, i in zip(starts, likeliest, strict=True)])
-        count = len(_FORCES)
-        shares = np.repeat(_FORCES, len(logs))
-        found = run(list(logs) * count, _joined([first] * count), shares, **trial)
-        total = found.likelihood.reshape(count, -1).sum(1)
-        whole = run(logs, first, [_FORCES[int(total.argmax())]] * len(logs))
+        share = likeliest_share(predictor, logs, first, theta=theta, noise=noise, rows=_TRIAL)
+        whole = run(logs, first, [share] * len(logs))
         states = smoothed(predictor, whole, [len(log) for log in logs])
         return [self._filled(predictor, log, states, i) for i, log in enumerate(logs)]
 
@@ -202,24 +198,6 @@ def _ranges(model: mujoco.MjModel, dofs: Sequence[int]) -> tuple[Array, Array]:
 
 def _initial(model: mujoco.MjModel) -> Array:
     return np.array(model.qpos0, dtype=np.float64)
-
-
-def _unknown_forces(predictor: Predictor) -> Array:
-    """Return what white forces of unit strength add to the state, ``(2 nv, 2 nv)``.
-
-    Unit strength changes a joint's momentum in one second by what its largest force would.
-    """
-    model, robot = predictor.system.task.model, predictor.system.robot
-    data = mujoco.MjData(model)
-    inertia = np.zeros((model.nv, model.nv))
-    mujoco.mj_forward(model, data)
-    mujoco.mj_fullM(model, data, inertia)
-    force = np.sqrt(np.diag(inertia)) * 4.0
-    force[list(robot.dof_index)] = robot.force_scale.numpy()
-    pushed = np.linalg.solve(inertia, np.diag(force))
-    white = pushed @ pushed.T
-    dt = predictor.system.control_dt
-    return np.block([[dt**3 / 3 * white, dt**2 / 2 * white], [dt**2 / 2 * white, dt * white]])
 
 
 def _joined(beliefs: Sequence[Beliefs]) -> Beliefs:

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 _LADDER = (3, 10, 20, 40, 80, 160)
 _LARGEST, _LARGEST_UNSURE = 0.2, 0.4  # of the median log's length
 _UNSURE = 20  # the least where start states were estimated
+_FILTERED = 10  # where the depth of contacts was
 _PROBE = 100  # control steps on which horizons are compared
 _WORTH = 0.2  # nats per effect that a longer horizon must bring
 
@@ -36,14 +37,16 @@ def chosen_horizon(
     Chosen on what simulations of the effects would look like, never on the residuals: largest
     ``Σ_e log(1 + λ_e)`` with ``λ_e`` the squared length of the whitened signature at a tenth of the
     range, as long as second differences stay below first ones. Where start states were estimated,
-    few steps hardly say how a segment began, and nothing else.
+    few steps hardly say how a segment began, and nothing else; nor where contacts were.
     """
     prior = predictor.system.prior
     z = origin(prior)
     units = list({unit.name: unit for unit in units}.values())
     typical = float(np.median([len(log) for log in logs]))
     guessed = any(log.uncertainty is not None for log in logs)
-    ladder = [steps for steps in _LADDER if steps >= _UNSURE] if guessed else _LADDER
+    filtered = any(log.contact_step is not None for log in logs)
+    least = _UNSURE if guessed else _FILTERED if filtered else 0
+    ladder = [steps for steps in _LADDER if steps >= least]
     best, choice = -np.inf, ladder[0]
     for steps in ladder:
         if steps > typical * (_LARGEST_UNSURE if guessed else _LARGEST):

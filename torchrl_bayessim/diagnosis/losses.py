@@ -127,7 +127,7 @@ class _Data:
         # a start that was not renewed is where the robot was a step before
         offsets = np.zeros((1, len(segments), 2 * predictor.tangent.size))
         offsets[0, :, sensing.channels[channel]] = shown[:, 1] - shown[:, 0]
-        start = objective([self.point], offsets)[0] - self.left
+        start = objective([self.point], segments.freed(offsets))[0] - self.left
         columns = objective.whitening.inverse[:, :, channel :: len(sensing.channels)]
         for begin, *lost in patterns:
             # what was measured, minus what would have been shown

@@ -97,8 +97,7 @@ class Predictor:
         task = self.system.task
         model = copy.copy(task.model)
         model.opt.timestep = task.dt / substeps
-        colliding = (model.geom_contype | model.geom_conaffinity).any()
-        if not (colliding or model.npair or model.nflex):
+        if not self.colliding:
             # looking for contacts that cannot be takes an eighth of the time
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         self._models = ModelBatch(model, 1)
@@ -108,6 +107,13 @@ class Predictor:
             for name in ("dof_frictionloss", "dof_damping")
         }
         self._stepper = Stepper(model, 1, drive=task.drive, threads=self._threads)
+
+    @property
+    def colliding(self) -> bool:
+        """Whether anything can touch anything."""
+        model = self.system.task.model
+        colliding = (model.geom_contype | model.geom_conaffinity).any()
+        return bool(colliding or model.npair or model.nflex)
 
     def exactly(self) -> None:
         """From now on take the task's own time steps, and let forces follow the state at each."""
@@ -201,7 +207,11 @@ class Predictor:
         stepper.use(self._models.repeated(size))
         stepper.state[:] = stepper.initial
         step = np.zeros((count, size, 2 * self.tangent.size))
-        step[..., self.sensing.channels] += restored[:, :, at] if restored is not None else 0.0
+        if restored is not None:
+            step[..., self.sensing.channels] = restored[:, :, at]
+            step = segments.freed(step)
+        if segments.contact_step is not None:
+            step += segments.contact_step
         if offsets is not None:
             step += offsets if offsets.ndim == 3 else offsets[:, None]
         half = self.tangent.size

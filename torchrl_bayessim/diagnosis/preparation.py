@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from ..errors import message
 from ..logs.log import Log
 from ..logs.system import System
+from .contacts import one_sided, settled
 from .hidden import hidden_joints
 from .modes import Mode, Trajectories, shortest
 from .noise import assumed_noise
 from .objective import Objective, Point, Unit, origin, parameters_at
 from .prediction import Predictor
-from .refit import Fit, refit
+from .refit import Fit, refit, with_width
 from .segments import Segments, cut, cut_for_fits
 from .time_steps import with_fewest_steps
 from .velocity_errors import with_velocity_errors
@@ -162,6 +163,8 @@ def prepare(
     some = cut(parts["train"], min(_STEPS, rows // 2), history=history, most=_FEW)
     predictor = with_fewest_steps(predictor, some, units, z=origin(system.prior), noise=noise)
     noise, source = mode.noise(predictor, parts["train"], history=history, alarms=alarms)
+    if one_sided(predictor, parts["train"], theta=theta, noise=noise):
+        parts = {n: settled(predictor, part, theta=theta, noise=noise) for n, part in parts.items()}
     if horizon is None:
         horizon = mode.horizon(predictor, parts, units=units, noise=noise, history=history)
     pieces = {
@@ -223,9 +226,10 @@ def _nominal(
     some = pieces["train"].take(np.arange(0, len(pieces["train"]), every))
     for _ in range(2):
         objective = mode.objective(predictor, prior, some, z=z, noise=noise)
-        z = refit(objective, [Point(z)])[0].point.z
+        z = refit(with_width(objective, Point(z)), [Point(z)])[0].point.z
     sets = {}
     for name, part in pieces.items():
         bare = mode.objective(predictor, prior, part, z=z, noise=noise, generator=generator)
         sets[name] = bare.weighted(Point(z))
+    sets["train"] = with_width(sets["train"], Point(z))
     return refit(sets["train"], [Point(z)])[0], sets

@@ -16,6 +16,7 @@ from ..effects.sensors import SensorDropout
 from ..effects.units import unit_at
 from ..logs.log import Log
 from .chance import Chance
+from .contacts import settled
 from .holds import Hold
 from .objective import Point, Unit, strengths_of
 from .preparation import Prepared, split
@@ -32,9 +33,9 @@ def gap_with_holds(prepared: Prepared, logs: Sequence[Log], selection: Selection
     if test.segments.uncertainty is not None:  # the held samples entered the estimates too
         return 1.0
     size = len(test.segments)
-    pieces = prepared.mode.cut(
-        split(logs)["test"], prepared.horizon, history=test.segments.history, most=size
-    )
+    theta = test.theta(selection.nominal.fit.point.z)
+    whole = settled(prepared.predictor, split(logs)["test"], theta=theta, noise=prepared.noise)
+    pieces = prepared.mode.cut(whole, prepared.horizon, history=test.segments.history, most=size)
     if len(pieces) != size:
         return 1.0
     left = test.along(pieces)([selection.nominal.fit.point])[0]

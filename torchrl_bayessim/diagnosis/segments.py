@@ -22,6 +22,7 @@ from ..logs.log import Log
 Array = NDArray[np.float64]
 _CHECKS = 10  # compared rows per segment
 _SKIP = 5  # control steps: the longest delay
+_OF_STARTS = "uncertainty", "contact_step", "contact_free", "contact_error"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +46,10 @@ class Segments:
         velocity_error: Of an estimated velocity, where motion is too fast for it, ``(nv,)``.
         uncertainty: Covariance of what was estimated of each start state, ``(S, 2 nv, 2 nv)``;
             nothing where all that matters was measured.
+        contact_step: From each measured start to one that contacts allow, ``(S, 2 nv)``; nothing
+            where nothing touches.
+        contact_free: What is left there of an error of the measured start, ``(S, 2 nv, 2 nv)``.
+        contact_error: Covariance of the rest of the errors there, ``(S, 2 nv, 2 nv)``.
     """
 
     horizon: int
@@ -59,6 +64,9 @@ class Segments:
     velocity_gain: Array
     velocity_error: Array
     uncertainty: Array | None = None
+    contact_step: Array | None = None
+    contact_free: Array | None = None
+    contact_error: Array | None = None
 
     def __len__(self) -> int:
         return len(self.start)
@@ -68,14 +76,17 @@ class Segments:
         """Where in a window the compared rows are, shape ``(K,)``."""
         return self.history + self.checked
 
+    def freed(self, steps: Array) -> Array:
+        """Return what contacts leave of errors of measured starts, ``(*, S, 2 nv)``."""
+        if self.contact_free is None:
+            return steps
+        return np.einsum("sij,...sj->...si", self.contact_free, steps)
+
     def take(self, index: NDArray[np.int64]) -> Segments:
         """Return some of the segments."""
-        arrays = {
-            n: getattr(self, n)[index] for n in ("log", "start", "time", "qpos", "qvel", "ctrl")
-        }
-        if self.uncertainty is not None:
-            arrays["uncertainty"] = self.uncertainty[index]
-        return replace(self, **arrays)
+        names = "log", "start", "time", "qpos", "qvel", "ctrl", *_OF_STARTS
+        known = {n: getattr(self, n) for n in names if getattr(self, n) is not None}
+        return replace(self, **{n: values[index] for n, values in known.items()})
 
 
 def cut(
@@ -157,13 +168,13 @@ def cut(
         windows("ctrl"),
         gains.max(0),
         np.max([np.zeros(gains.shape[1]), *errors], axis=0),
-        _uncertainty(logs, found),
+        **{name: _of_starts(logs, found, name) for name in _OF_STARTS},
     )
 
 
-def _uncertainty(logs: Sequence[Log], found: Sequence[tuple[int, int]]) -> Array | None:
-    """Return that of the starts, log ``i`` and row ``k`` each."""
-    known = [log.uncertainty for log in logs if log.uncertainty is not None]
+def _of_starts(logs: Sequence[Log], found: Sequence[tuple[int, int]], name: str) -> Array | None:
+    """Return what is known of the starts, log ``i`` and row ``k`` each."""
+    known = [getattr(log, name) for log in logs if getattr(log, name) is not None]
     if len(known) < len(logs):
         return None
     return np.stack([known[i][k].numpy() for i, k in found])

@@ -73,7 +73,7 @@ class Sensing:
             record = measured.expand(count, *measured.shape)
             seen = measured_sequence(effect, record, strength, robot, time=time, seed=seed)
             steps[..., self.channels] += (measured - seen)[:, :, at].numpy()
-        return steps
+        return segments.freed(steps)
 
     def values(self, qpos: Array, qvel: Array) -> Array:
         """Return what the channels of hinges and slides hold, zero for the others."""

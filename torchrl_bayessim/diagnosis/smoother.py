@@ -15,19 +15,21 @@ hypotheses, are one batch.
 
 from __future__ import annotations
 
-__all__ = ["Beliefs", "Filtered", "filtered", "smoothed"]
+__all__ = ["Beliefs", "Filtered", "filtered", "likeliest_share", "smoothed", "unknown_forces"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from ..logs.log import Log
 from .prediction import Predictor
-from .segments import Segments
+from .records import Record
 
 Array = NDArray[np.float64]
+_SHARES = (1e-3, 3e-3, 1e-2, 3e-2, 1e-1)  # of the largest force of a joint, in one second
 _TINY = 1e-10  # of the variance: keeps covariances positive definite
 _LOST = 1e6  # squared innovation, in units of its variance, of a simulation that diverged
 
@@ -90,7 +92,7 @@ def filtered(
     length = min(rows or 10**9, max(len(log) for log in logs))
     asked = np.diagonal(first.covariance, axis1=1, axis2=2) > 0
     forces = forces * (asked[:, :, None] & asked[:, None, :])
-    dynamics = _Dynamics(predictor, _Record(logs, length), theta, forces, noise)
+    dynamics = _Dynamics(predictor, Record(logs, length), theta, forces, noise)
     result = Filtered(np.zeros(len(logs)))
     belief = first
     for t in range(length):
@@ -129,38 +131,59 @@ def smoothed(predictor: Predictor, run: Filtered, lengths: Sequence[int]) -> lis
     return result[::-1]
 
 
-class _Record:
-    """Logs side by side; the shorter ones stand still at their ends."""
+def likeliest_share(
+    predictor: Predictor,
+    logs: Sequence[Log],
+    first: Beliefs,
+    *,
+    theta: Array,
+    noise: Array,
+    rows: int,
+) -> float:
+    """Return which share of `unknown_forces` makes the measurements likeliest.
 
-    def __init__(self, logs: Sequence[Log], length: int) -> None:
-        def padded(name: str) -> Array:
-            parts = [getattr(log, name).numpy() for log in logs]
-            return np.stack([p[np.minimum(np.arange(length), len(p) - 1)] for p in parts])
+    Args:
+        predictor: Simulates.
+        logs: One per belief.
+        first: Before the first measurement.
+        theta: Parameters, shape ``(D,)``.
+        noise: Standard deviation of each channel's noise, shape ``(C,)``.
+        rows: At most so many of each log.
+    """
+    count = len(_SHARES)
+    every = Beliefs(
+        *(np.concatenate([part] * count) for part in (first.qpos, first.qvel, first.covariance))
+    )
+    shares = np.repeat(_SHARES, len(logs))[:, None, None]
+    found = filtered(
+        predictor,
+        list(logs) * count,
+        every,
+        theta=theta,
+        forces=shares**2 * unknown_forces(predictor),
+        noise=noise,
+        rows=rows,
+        keep=False,
+    )
+    return _SHARES[int(found.likelihood.reshape(count, -1).sum(1).argmax())]
 
-        self.time, self.ctrl = padded("time"), padded("ctrl")
-        self.qpos, self.qvel = padded("qpos"), padded("qvel")
-        self.alive = np.arange(length) < np.array([len(log) for log in logs])[:, None]
 
-    def step(self, belief: Beliefs, t: int) -> Segments:
-        """Return segments of one control step from what is believed."""
+def unknown_forces(predictor: Predictor) -> Array:
+    """Return what white forces of unit strength add to the state, ``(2 nv, 2 nv)``.
 
-        def twice(values: Array) -> Array:
-            return np.repeat(values[:, None], 2, axis=1)
-
-        none = np.zeros(len(self.time), dtype=np.int64)
-        return Segments(
-            horizon=1,
-            history=0,
-            checked=np.ones(1, dtype=np.int64),
-            log=none,
-            start=none,
-            time=twice(self.time[:, t]),
-            qpos=twice(belief.qpos),
-            qvel=twice(belief.qvel),
-            ctrl=twice(self.ctrl[:, t]),
-            velocity_gain=np.zeros(belief.qvel.shape[1]),
-            velocity_error=np.zeros(belief.qvel.shape[1]),
-        )
+    Unit strength changes a joint's momentum in one second by what its largest force would.
+    """
+    model, robot = predictor.system.task.model, predictor.system.robot
+    data = mujoco.MjData(model)
+    inertia = np.zeros((model.nv, model.nv))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, inertia)
+    force = np.sqrt(np.diag(inertia)) * 4.0
+    force[list(robot.dof_index)] = robot.force_scale.numpy()
+    pushed = np.linalg.solve(inertia, np.diag(force))
+    white = pushed @ pushed.T
+    dt = predictor.system.control_dt
+    return np.block([[dt**3 / 3 * white, dt**2 / 2 * white], [dt**2 / 2 * white, dt * white]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +191,7 @@ class _Dynamics:
     """How states follow one another, and what is seen of them."""
 
     predictor: Predictor
-    record: _Record
+    record: Record
     theta: Array
     forces: Array
     noise: Array
@@ -212,7 +235,9 @@ class _Dynamics:
         columns = np.moveaxis(root, -1, 0)
         offsets = np.concatenate([np.zeros_like(columns[:1]), columns, -columns])
         thetas = np.repeat(self.theta[None], len(offsets), 0)
-        states = self.predictor.states(self.record.step(belief, t), thetas, None, offsets)
+        states = self.predictor.states(
+            self.record.step(belief.qpos, belief.qvel, t), thetas, None, offsets
+        )
         qpos, qvel = (part[:, :, 0] for part in states)
         fine = np.isfinite(np.concatenate([qpos, qvel], -1)).all((0, 2)).reshape(-1, 1)
         qpos, qvel = np.where(fine, qpos, belief.qpos), np.where(fine, qvel, belief.qvel)

@@ -16,7 +16,14 @@ are innovations: white, of unit variance, for a perfect simulator.
 
 from __future__ import annotations
 
-__all__ = ["ENOUGH", "Whitening", "innovation_noise", "noise_from_differences", "whitening"]
+__all__ = [
+    "ENOUGH",
+    "Whitening",
+    "innovation_noise",
+    "noise_from_differences",
+    "start_deviations",
+    "whitening",
+]
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..logs.log import Log
+from ..logs.system import System
 from .prediction import Predictor
 from .segments import Segments
 
@@ -157,24 +165,48 @@ def _start_noise(predictor: Predictor, segments: Segments, noise: Array) -> Arra
     Their squares sum up to the covariance.
     """
     size = predictor.tangent.size
-    start = np.zeros(2 * size)
-    start[list(predictor.system.channel_index)] = noise
-    # An estimated velocity knows of the rows that it is to predict: three times its noise leaves
-    # the segment itself to say how fast it began.
-    estimated = _KNOWN * segments.velocity_gain * start[:size]
-    start[size:] = np.maximum(start[size:], np.maximum(estimated, segments.velocity_error))
+    start = start_deviations(
+        predictor.system, noise, segments.velocity_gain, segments.velocity_error
+    )
     steps = np.diag(start)[start > 0]
     steps = np.broadcast_to(steps[:, None], (len(steps), len(segments), 2 * size))
-    if segments.uncertainty is None:
-        return steps
-    # So does an estimated position.
-    asked = np.flatnonzero(segments.uncertainty.any((0, 1)))
-    some = segments.uncertainty[:, asked[:, None], asked]
+    roots = [segments.freed(steps)]
+    if segments.contact_error is not None:
+        roots.append(_roots(segments.contact_error))
+    if segments.uncertainty is not None:
+        roots.append(_KNOWN * _roots(segments.uncertainty))  # so does an estimated position
+    return np.concatenate(roots)
+
+
+def _roots(covariance: Array) -> Array:
+    """Return steps whose squares sum up to covariances ``(S, 2 nv, 2 nv)``, ``(J, S, 2 nv)``."""
+    asked = np.flatnonzero(covariance.any((0, 1)))
+    some = covariance[:, asked[:, None], asked]
     variances = np.einsum("sii->si", some)
-    roots = np.zeros((len(segments), 2 * size, len(asked)))
+    roots = np.zeros((*covariance.shape[:2], len(asked)))
     safe = some + 1e-9 * np.einsum("si,ij->sij", variances, np.eye(len(asked)))
-    roots[:, asked] = _KNOWN * np.linalg.cholesky(safe)
-    return np.concatenate([steps, np.moveaxis(roots, -1, 0)])
+    values, vectors = np.linalg.eigh(safe)
+    roots[:, asked] = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+    return np.moveaxis(roots, -1, 0)
+
+
+def start_deviations(system: System, noise: Array, gain: Array, error: Array) -> Array:
+    """Return the standard deviation of each coordinate of a measured start, ``(2 nv,)``.
+
+    Args:
+        system: The robot.
+        noise: Standard deviation of each channel's noise, shape ``(C,)``.
+        gain: Noise of an estimated velocity per noise of the position, ``(nv,)``.
+        error: Of an estimated velocity, where motion is too fast for it, ``(nv,)``.
+    """
+    size = len(gain)
+    start = np.zeros(2 * size)
+    start[list(system.channel_index)] = noise
+    # An estimated velocity knows of the rows that it is to predict: three times its noise leaves
+    # the segment itself to say how fast it began.
+    estimated = _KNOWN * gain * start[:size]
+    start[size:] = np.maximum(start[size:], np.maximum(estimated, error))
+    return start
 
 
 def noise_from_differences(logs: Sequence[Log], values: Sequence[Array]) -> Array:
