@@ -66,20 +66,22 @@ def alternatives(
 def _nearer(
     sets: tuple[Objective, Objective], best: Model, name: str, known: Sequence[Model]
 ) -> list[Model]:
-    """Return what acts alike fitted once more, from the parameters of the best model.
+    """Return friction in contacts or joints, in the other's place, from the best's parameters.
 
     Where residuals are rough, a fit from afar ends anywhere: with what it had, and twice as much.
     """
+    groups = {unit.effect.group for unit in best.units if unit.name == name}
     mine = {kind(unit.effect) for unit in best.units if unit.name == name}
     starts = []
     for model in known:
         added = [unit for unit in model.units if unit not in best.units]
-        if {kind(unit.effect) for unit in added} == mine:
+        other = {unit.effect.group for unit in added} != groups
+        if other and {kind(unit.effect) for unit in added} == mine:
             strengths = model.fit.point.strengths
             for times in (1.0, 2.0):
                 more = {u: u.inside(times * strengths[u]) for u in added}
                 starts.append(Point(best.fit.point.z, {**strengths, **more}))
-    return judged(*sets, refit(sets[0], starts)) if starts else []
+    return judged(*sets, refit(sets[0], starts, race=best.fit.cost)) if starts else []
 
 
 def kind(effect: Effect) -> str:
