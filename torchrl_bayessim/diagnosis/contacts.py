@@ -14,11 +14,14 @@ the likeliest step that has the depth::
 
 for velocities likewise. What noise ``e`` and the filter's covariance ``P`` leave of errors there is
 ``(I - Π) e``, and ``Π P Πᵀ``.
+
+A simulator that is far off, or so chaotic that its parameters are, makes a filter worse than a
+sensor: it is believed where most segments are likelier with its starts.
 """
 
 from __future__ import annotations
 
-__all__ = ["one_sided", "settled"]
+__all__ = ["likelier", "one_sided", "resting", "settled"]
 
 import copy
 from collections.abc import Sequence
@@ -31,13 +34,13 @@ from numpy.typing import NDArray
 
 from ..logs.log import Log
 from .prediction import Predictor
-from .segments import cut_for_fits
+from .segments import Segments, cut_for_fits
 from .smoother import Beliefs, filtered, likeliest_share, unknown_forces
 from .whitening import start_deviations, whitening
 
 Array = NDArray[np.float64]
 _NEAR = 2.0  # standard deviations of the depth within which a body touches
-_STEPS, _FEW = 10, 12  # of a segment, and segments, on which noise is tried
+_STEPS, _FEW, _MANY = 10, 12, 60  # of a segment; segments on which noise is tried, and starts
 _BENT = 1.0  # ratio of second to first differences
 _TRIAL = 80  # rows that say how strong unknown forces are
 
@@ -47,11 +50,61 @@ def one_sided(predictor: Predictor, logs: Sequence[Log], *, theta: Array, noise:
 
     Arguments are those of `settled`.
     """
-    steps = min(_STEPS, max(len(log) for log in logs) - 1)
     if not predictor.colliding:
         return False
-    pieces = cut_for_fits(logs, steps, history=steps, most=_FEW)
-    return whitening(predictor, pieces, theta, noise).curvature > _BENT
+    return whitening(predictor, _pieces(logs, _FEW), theta, noise).curvature > _BENT
+
+
+def likelier(
+    predictor: Predictor,
+    logs: Sequence[Log],
+    starts: Sequence[Log],
+    *,
+    theta: Array,
+    noise: Array,
+) -> bool:
+    """Return whether more than half of all segments are likelier with other starts.
+
+    Args:
+        predictor: Simulates.
+        logs: The logs.
+        starts: The same with the steps to states that contacts allow.
+        theta: Parameters, shape ``(D,)``.
+        noise: Standard deviation of each channel's noise, shape ``(C,)``.
+    """
+    found = []
+    for some in (logs, starts):
+        pieces = _pieces(some, _MANY)
+        white = whitening(predictor, pieces, theta, noise)
+        found.append(white.log_likelihood(predictor.residuals(pieces, theta[None]))[0])
+    return float(np.mean(found[1] > found[0])) > 0.5
+
+
+def resting(predictor: Predictor, logs: Sequence[Log], *, noise: Array) -> NDArray[np.bool_]:
+    """Return of which coordinates of the state contacts mostly say most, shape ``(2 nv,)``.
+
+    Half of the variance of their noise, in half of the rows.
+
+    Args:
+        predictor: Simulates.
+        logs: The logs.
+        noise: Standard deviation of each channel's noise, shape ``(C,)``.
+    """
+    nothing = np.zeros(2 * predictor.tangent.size)
+    if not predictor.colliding:
+        return nothing > 0
+    touch = _Touch.of(predictor, logs, noise)
+    known = [
+        nothing if some is None else np.diag(touch.kept(some))
+        for log in logs
+        for some in touch.along(log)
+    ]
+    return np.mean(np.stack(known) > 0.5, axis=0) > 0.5
+
+
+def _pieces(logs: Sequence[Log], most: int) -> Segments:
+    steps = min(_STEPS, max(len(log) for log in logs) - 1)
+    return cut_for_fits(logs, steps, history=steps, most=most)
 
 
 def settled(predictor: Predictor, logs: Sequence[Log], *, theta: Array, noise: Array) -> list[Log]:
@@ -65,11 +118,7 @@ def settled(predictor: Predictor, logs: Sequence[Log], *, theta: Array, noise: A
     """
     if not predictor.colliding or any(log.uncertainty is not None for log in logs):
         return list(logs)
-    size = predictor.tangent.size
-    gain = np.max([log.velocity_gain.numpy() for log in logs], axis=0)
-    errors = [o.velocity_error.numpy() for o in logs if o.velocity_error is not None]
-    worst = np.max([np.zeros(size), *errors], axis=0)
-    touch = _Touch(predictor, start_deviations(predictor.system, noise, gain, worst))
+    touch = _Touch.of(predictor, logs, noise)
     normals = [touch.along(log) for log in logs]
     if not any(some is not None for one in normals for some in one):
         return list(logs)
@@ -131,6 +180,14 @@ class _Touch:
         # what is found so far apart; an angle counts as at one metre
         self._model.geom_margin += _NEAR * float(np.linalg.norm(self.deviations[0]))
         self._data = mujoco.MjData(self._model)
+
+    @classmethod
+    def of(cls, predictor: Predictor, logs: Sequence[Log], noise: Array) -> _Touch:
+        """Return that of measured logs."""
+        gain = np.max([log.velocity_gain.numpy() for log in logs], axis=0)
+        errors = [o.velocity_error.numpy() for o in logs if o.velocity_error is not None]
+        worst = np.max([np.zeros(predictor.tangent.size), *errors], axis=0)
+        return cls(predictor, start_deviations(predictor.system, noise, gain, worst))
 
     def along(self, log: Log) -> list[Array | None]:
         """Return the normals of contacts in joint space at every row, ``(c, nv)`` each."""

@@ -46,7 +46,7 @@ def baseless(effect: Finding, units: Sequence[Unit]) -> bool:
     """
     (low, high), ends = effect.ci95, _ends(units)
     return low <= 0 <= high and all(
-        _at_end(strength, ends.get((effect.name, place), _ANYTHING))
+        strength == 0 or _at_end(strength, ends.get((effect.name, place), _ANYTHING))
         for place, strength in effect.strengths.items()
     )
 

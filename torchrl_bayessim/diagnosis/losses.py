@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from ..effects.action import PacketDrop
 from ..effects.sensors import SensorDropout
 from .chance import Chance
+from .contacts import resting
 from .loss_law import LossLaw, Told, Tried, likeliest
 from .modes import Mode
 from .objective import Objective, Point, Unit, strengths_of
@@ -169,6 +170,7 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
         units: Random effects at their targets; of those lost commands and samples of one target.
     """
     some = [u for u in units if isinstance(u.effect, PacketDrop | SensorDropout) and _single(u)]
+    some = _telling(prepared, some)
     if not some or type(prepared.mode) is not Mode:
         return []
     nominal = _cut(prepared)
@@ -187,6 +189,17 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
     kept = [one for one in found if one.gain > max(_NEEDED, least)]
     kept.sort(key=lambda one: -one.gain)
     return [one for one in kept if one.gain > kept[0].gain - _LIKELY]
+
+
+def _telling(prepared: Prepared, units: Sequence[Unit]) -> list[Unit]:
+    """Return the units but for samples of what rests: it chatters, and one is like the next."""
+    sensing = prepared.predictor.sensing
+    still = resting(prepared.predictor, prepared.logs["train"], noise=prepared.noise)[
+        sensing.channels
+    ]
+    return [
+        u for u in units if isinstance(u.effect, PacketDrop) or not still[np.argmax(u.direction)]
+    ]
 
 
 def _apart(unit: Unit, others: Sequence[Unit]) -> bool:
@@ -237,10 +250,11 @@ def _cut(prepared: Prepared) -> dict[str, _Data]:
     prior, point = prepared.predictor.system.prior, Point(prepared.nominal.point.z)
     history = max(prepared.sets["train"].segments.history, 1)
     found = {}
+    generator = np.random.default_rng(0)  # of noise: what it does where bodies touch is no loss
     for name, logs in prepared.logs.items():
         pieces = cut(logs, _STEPS, history=history, most=_MOST[name], burn_in=history)
         objective = prepared.mode.objective(
-            prepared.predictor, prior, pieces, z=point.z, noise=prepared.noise
+            prepared.predictor, prior, pieces, z=point.z, noise=prepared.noise, generator=generator
         )
         found[name] = _Data.of(objective, point)
     return found

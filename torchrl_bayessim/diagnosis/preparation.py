@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..errors import message
 from ..logs.log import Log
 from ..logs.system import System
-from .contacts import one_sided, settled
+from .contacts import likelier, one_sided, settled
 from .hidden import hidden_joints
 from .modes import Mode, Trajectories, shortest
 from .noise import assumed_noise
@@ -163,8 +163,7 @@ def prepare(
     some = cut(parts["train"], min(_STEPS, rows // 2), history=history, most=_FEW)
     predictor = with_fewest_steps(predictor, some, units, z=origin(system.prior), noise=noise)
     noise, source = mode.noise(predictor, parts["train"], history=history, alarms=alarms)
-    if one_sided(predictor, parts["train"], theta=theta, noise=noise):
-        parts = {n: settled(predictor, part, theta=theta, noise=noise) for n, part in parts.items()}
+    parts = _in_contact(predictor, parts, noise=noise, history=history)
     if horizon is None:
         horizon = mode.horizon(predictor, parts, units=units, noise=noise, history=history)
     pieces = {
@@ -173,6 +172,23 @@ def prepare(
     }
     nominal, sets = _nominal(predictor, pieces, mode, noise=noise, generator=generator)
     return Prepared(predictor, sets, parts, noise, source, horizon, nominal, tuple(alarms), mode)
+
+
+def _in_contact(
+    predictor: Predictor, parts: Mapping[str, list[Log]], *, noise: Array, history: int
+) -> dict[str, list[Log]]:
+    """Return the logs with starts that contacts allow, where those make predictions likelier."""
+    prior, train = predictor.system.prior, parts["train"]
+    theta = parameters_at(prior, origin(prior))
+    if not one_sided(predictor, train, theta=theta, noise=noise):
+        return dict(parts)
+    steps = min(_STEPS, shortest(parts) // 2)
+    pieces = cut_for_fits(train, steps, history=history, most=_MANY)
+    fit, _ = _nominal(predictor, {"train": pieces}, Mode(), noise=noise)
+    theta = parameters_at(prior, fit.point.z)
+    found = {n: settled(predictor, part, theta=theta, noise=noise) for n, part in parts.items()}
+    better = likelier(predictor, train, found["train"], theta=theta, noise=noise)
+    return found if better else dict(parts)
 
 
 def _completed(

@@ -33,8 +33,10 @@ def gap_with_holds(prepared: Prepared, logs: Sequence[Log], selection: Selection
     if test.segments.uncertainty is not None:  # the held samples entered the estimates too
         return 1.0
     size = len(test.segments)
-    theta = test.theta(selection.nominal.fit.point.z)
-    whole = settled(prepared.predictor, split(logs)["test"], theta=theta, noise=prepared.noise)
+    whole = split(logs)["test"]
+    if test.segments.contact_step is not None:
+        theta = test.theta(selection.nominal.fit.point.z)
+        whole = settled(prepared.predictor, whole, theta=theta, noise=prepared.noise)
     pieces = prepared.mode.cut(whole, prepared.horizon, history=test.segments.history, most=size)
     if len(pieces) != size:
         return 1.0

@@ -117,7 +117,7 @@ class _Weighed:
 
     Attributes:
         measured: How far the gap shrinks on test runs.
-        significant: Whether the search, or chance, found something.
+        significant: Whether the search found something that helps, or chance, surely.
         certain: Whether noise alone would never do this.
         visible: Whether the gap can be seen without a cause.
         validated: Share of the gap that is explained on validation runs.
@@ -152,10 +152,15 @@ class _Weighed:
         shown |= lowest > SHOWN and max(others) > _UNEXPLAINED
         visible = least > _PLAIN or (lowest > 1.0 and shown)
         validated = share_on_validation(selection) if effects else 0.0
-        perhaps_nothing = measured.explained_ci[0] <= 0 and validated < PARTIAL and not scattered
+        # runs that hold little of what chance does say nothing against it, if it is sure
+        surely = min((e.p_value for e in effects), default=1.0) < _CERTAIN
+        by_chance = bool(scattered) and (surely or measured.refit > SHOWN)
+        perhaps_nothing = measured.explained_ci[0] <= 0 and validated < PARTIAL and not by_chance
         unsaid = measured.explained < PARTIAL or perhaps_nothing
         elsewhere = unsaid and hardly_shown(measured) and validated >= enough(p_value)
-        significant = p_value <= alpha or bool(scattered)
+        borne_out = measured.effects < measured.refit or validated >= PARTIAL
+        found = p_value <= alpha and borne_out and bool(selection.best.units)
+        significant = found or by_chance
         return cls(measured, significant, certain, visible, validated, unsaid, elsewhere)
 
     def named(self, *, ambiguous: bool) -> Verdict:

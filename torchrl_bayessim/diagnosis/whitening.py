@@ -72,6 +72,11 @@ class Whitening:
         white = np.nan_to_num(white, nan=_WORST, posinf=_WORST, neginf=-_WORST)
         return np.clip(white, -_WORST, _WORST) * self.weights[:, None]
 
+    def log_likelihood(self, residual: Array) -> Array:
+        """Return ``-½ (‖ε_i‖² + log det C_i)`` of residuals ``(P, S, K, C)``, shape ``(P, S)``."""
+        scale = np.log(np.einsum("sii->si", self.inverse)).sum(1)
+        return scale - 0.5 * (self(residual) ** 2).sum(-1)
+
     def take(self, index: NDArray[np.int64]) -> Whitening:
         """Return that of some of the segments."""
         names = "inverse", "weights", "spread", "drift"
