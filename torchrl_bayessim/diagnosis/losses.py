@@ -250,11 +250,10 @@ def _cut(prepared: Prepared) -> dict[str, _Data]:
     prior, point = prepared.predictor.system.prior, Point(prepared.nominal.point.z)
     history = max(prepared.sets["train"].segments.history, 1)
     found = {}
-    generator = np.random.default_rng(0)  # of noise: what it does where bodies touch is no loss
     for name, logs in prepared.logs.items():
         pieces = cut(logs, _STEPS, history=history, most=_MOST[name], burn_in=history)
         objective = prepared.mode.objective(
-            prepared.predictor, prior, pieces, z=point.z, noise=prepared.noise, generator=generator
+            prepared.predictor, prior, pieces, z=point.z, noise=prepared.noise
         )
         found[name] = _Data.of(objective, point)
     return found

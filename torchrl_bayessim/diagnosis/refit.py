@@ -170,7 +170,7 @@ def with_width(objective: Objective, point: Point) -> Objective:
         point: Where derivatives of the parameters are compared.
     """
     rows = np.eye(objective.size)[:-1]
-    if not len(rows) or objective.segments.contact_step is None:
+    if not len(rows):
         return objective
     moved = np.concatenate([objective.width * rows, _WIDE * rows])
     ends = [Point(point.z + step) for step in moved]

@@ -158,7 +158,7 @@ class _Weighed:
         perhaps_nothing = measured.explained_ci[0] <= 0 and validated < PARTIAL and not by_chance
         unsaid = measured.explained < PARTIAL or perhaps_nothing
         elsewhere = unsaid and hardly_shown(measured) and validated >= enough(p_value)
-        borne_out = measured.effects < measured.refit or validated >= PARTIAL
+        borne_out = certain or measured.effects < measured.refit or validated >= PARTIAL
         found = p_value <= alpha and borne_out and bool(selection.best.units)
         significant = found or by_chance
         return cls(measured, significant, certain, visible, validated, unsaid, elsewhere)
