@@ -157,7 +157,9 @@ class _Weighed:
         by_chance = bool(scattered) and (surely or measured.refit > SHOWN)
         perhaps_nothing = measured.explained_ci[0] <= 0 and validated < PARTIAL and not by_chance
         unsaid = measured.explained < PARTIAL or perhaps_nothing
+        contradicted = measured.effects > SHOWN * measured.refit  # by what test runs do show
         elsewhere = unsaid and hardly_shown(measured) and validated >= enough(p_value)
+        elsewhere &= not contradicted
         borne_out = certain or measured.effects < measured.refit or validated >= PARTIAL
         found = p_value <= alpha and borne_out and bool(selection.best.units)
         significant = found or by_chance
