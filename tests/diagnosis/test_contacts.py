@@ -1,5 +1,6 @@
 """A block that rests on a plane: its measured height is noisier than contact allows."""
 
+from dataclasses import replace
 from functools import cache
 
 import mujoco
@@ -8,7 +9,7 @@ import pytest
 import torch
 
 from torchrl_bayessim import diagnose
-from torchrl_bayessim.diagnosis.contacts import settled
+from torchrl_bayessim.diagnosis.contacts import likelier, resting, settled
 from torchrl_bayessim.diagnosis.prediction import Predictor
 from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.inference.priors import BoxPrior
@@ -83,6 +84,26 @@ def test_starts_in_contact_have_the_depth_that_the_simulator_has():
         after.append((wrong + log.contact_step[:, 1].numpy())[20:])
         assert not log.contact_step[:, [0, 2]].any()  # along the plane nothing is known better
     assert np.sqrt(np.mean(np.square(after))) < 0.5 * np.sqrt(np.mean(np.square(before)))
+
+
+def test_a_filter_is_believed_only_where_it_makes_predictions_likelier():
+    logs = [recorded(run)[0] for run in range(3)]
+    known = {"theta": np.array([1.0, 0.2]), "noise": NOISE}
+    predictor = Predictor(system())
+    right = settled(predictor, logs, **known)
+    assert likelier(predictor, logs, right, **known)
+    assert not likelier(predictor, right, logs, **known)
+    thrown = torch.tensor([0.0, 0.0, 0.0, 0.5]).double()  # m/s
+    wrong = [replace(log, contact_step=log.contact_step + thrown) for log in right]
+    assert not likelier(predictor, logs, wrong, **known)
+
+
+def test_what_rests_is_told_from_what_slides_and_from_what_flies():
+    log, _ = recorded(0)
+    still = resting(Predictor(system()), [log], noise=NOISE)
+    assert still.tolist() == [False, True, False, True]  # x, z, and their velocities
+    log.qpos[:, 1] += 1.0
+    assert not resting(Predictor(system()), [log], noise=NOISE).any()
 
 
 def test_a_robot_in_the_air_starts_where_it_was_measured():
