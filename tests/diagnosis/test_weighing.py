@@ -1,0 +1,70 @@
+"""What speaks for a cause where test runs hardly show the gap, or speak against it."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
+from torchrl_bayessim.diagnosis.verdict import _Weighed
+
+
+def verdict(*, refit, left, sure, chance=False, validation=(1.0, 1.0), interval=(-2.0, 1.0)):
+    """Return the verdict on one effect: mean squared innovations of test runs and validation."""
+    explained = (refit - left) / max(refit - 1.0, 1e-9)
+    share = float(np.clip(explained, -1.0, 1.0))
+    excess = (-0.2, 0.3) if refit < 1.05 else (0.5 * (refit - 1.0), 2 * refit)
+    measured = Shrinkage(9.0, refit, left, share, interval, excess, (left - 1.1, left - 0.9))
+    models = [
+        SimpleNamespace(
+            units=units,
+            validation=np.full((20, 100), mean**0.5),
+            fit=SimpleNamespace(innovations=np.full((20, 100), mean**0.5)),
+        )
+        for units, mean in zip(((), ("unit",)), validation, strict=True)
+    ]
+    found = SimpleNamespace(
+        p_values=[1.0 if chance else sure],
+        nominal=models[0],
+        best=models[0] if chance else models[1],
+    )
+    weighed = _Weighed.of(
+        found,
+        measured,
+        [SimpleNamespace(p_value=sure)],
+        scattered={"losses"} if chance else set(),
+        alpha=0.01,
+    )
+    return weighed.named(ambiguous=False)
+
+
+@pytest.mark.parametrize(
+    ("sure", "refit", "said"),
+    [
+        (1e-60, 1.02, "named_partial"),  # test runs hold hardly any of it
+        (1e-12, 1.02, "none"),
+        (1e-60, 1.15, "named_partial"),
+        (1e-12, 1.15, "none"),
+        (1e-12, 3.0, "named_partial"),
+    ],
+)
+def test_of_chance_on_a_small_gap_only_what_is_sure_is_named(sure, refit, said):
+    assert verdict(refit=refit, left=1.0, sure=sure, chance=True) == said
+
+
+@pytest.mark.parametrize(
+    ("left", "sure", "validation", "said"),
+    [
+        (0.9, 1e-3, (1.0, 1.0), "named_partial"),
+        (0.99, 1e-3, (1.0, 1.0), "none"),  # test runs are further off with it
+        (0.99, 1e-3, (3.0, 1.2), "named_partial"),  # but validation runs are not
+        (0.99, 1e-40, (1.0, 1.0), "named_partial"),
+    ],
+)
+def test_a_cause_of_a_gap_too_small_to_show_must_help_somewhere(left, sure, validation, said):
+    assert verdict(refit=0.95, left=left, sure=sure, validation=validation) == said
+
+
+@pytest.mark.parametrize(("left", "said"), [(11.0, "named_partial"), (23.0, "unknown")])
+def test_validation_runs_name_nothing_that_makes_test_runs_worse(left, said):
+    assert verdict(refit=11.3, left=left, sure=1e-20, validation=(12.0, 2.0)) == said
