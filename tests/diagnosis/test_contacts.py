@@ -98,6 +98,14 @@ def test_a_filter_is_believed_only_where_it_makes_predictions_likelier():
     assert not likelier(predictor, logs, wrong, **known)
 
 
+def test_a_mass_and_an_armature_are_not_taken_for_friction_of_the_contact():
+    logs = [recorded(70 + k, friction=0.28, rows=250)[0] for k in range(5)]
+    effects = "contact_friction", "armature"
+    report = diagnose(system(), None, logs, effects=effects)
+    assert report.effects[0].name == "contact_friction"
+    assert report.effects[0].strength == pytest.approx(-0.3, abs=0.1)
+
+
 def test_what_rests_is_told_from_what_slides_and_from_what_flies():
     log, _ = recorded(0)
     still = resting(Predictor(system()), [log], noise=NOISE)

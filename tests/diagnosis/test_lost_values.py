@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from test_diagnose import logs, system
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.loss_law import LossLaw, Tried, likeliest
+from torchrl_bayessim.diagnosis.losses import _explained
+from torchrl_bayessim.diagnosis.model import Model
 
 SOME = ("action_delay", "action_jitter", "packet_drop", "sensor_dropout", "coulomb_friction")
 
@@ -39,6 +42,22 @@ def rough(share, rng):
 
 def explained(report):
     return report.gap.explained_fraction
+
+
+@pytest.mark.parametrize(
+    ("units", "calm", "left", "explained"),
+    [
+        (("delay",), True, 1.0, True),
+        (("delay",), True, 4.0, False),  # over longer segments
+        (("delay",), False, 1.0, False),
+        ((), True, 1.0, False),
+    ],
+)
+def test_a_lag_explains_lost_commands_only_if_it_does_over_long_segments(
+    units, calm, left, explained
+):
+    best = Model(fit=SimpleNamespace(units=units), validation=np.full((9, 4), left**0.5), logs=None)
+    assert _explained(SimpleNamespace(calm=calm), best) is explained
 
 
 @pytest.mark.parametrize("share", [0.02, 0.1])

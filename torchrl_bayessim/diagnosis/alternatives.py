@@ -10,17 +10,22 @@ __all__ = ["alternatives", "exchanged", "kind"]
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from ..effects.contacts import ContactFriction
 from ..effects.effect import Effect
 from ..effects.joints import CoulombFriction
+from ..effects.transmission import ServoDeadBand
 from .explanations import compare
 from .model import LIKELY, Model, criterion, gain, judged, needed
 from .objective import Objective, Point, Unit
-from .refit import refit
+from .refit import WIDE, refit
 from .screening import Screen
 
 _ALIKE = 4  # models with an effect of the same group in its place
 _RIVALS = 6  # models with another effect in the place of one
+_MORE, _LITTLE = 5.0, 0.05  # mean squared innovation; share of friction's range, to start from
+_ALONG = (0.25, 0.5)  # of the range of friction in contacts, to start from
 
 
 def alternatives(
@@ -57,10 +62,48 @@ def alternatives(
             if len(additions) < most:
                 additions.setdefault(unit.effect, {unit: strength})
         known += _fitted(train, validation, base, list(additions.values()), race=best.fit.cost)
+        known += _sliding((train, validation), best, kept, units)
+        known += _sticking((train, validation), best, name, units)
         if train.width > Objective.width:
             known += _nearer((train, validation), best, name, known)
         result[name] = tuple(known)
     return result
+
+
+def _sliding(
+    sets: tuple[Objective, Objective], best: Model, kept: dict[Unit, float], units: Sequence[Unit]
+) -> list[Model]:
+    """Return friction in contacts in the place of an effect, fitted from the prior's centre.
+
+    With another mass, and an armature beside it, all that slides moves as with another friction.
+    Between the two lies a valley that no descent goes along; and what sticks and slips is rough.
+    """
+    unit = next((u for u in units if isinstance(u.effect, ContactFriction)), None)
+    if unit is None or unit in best.units:
+        return []
+    centre = np.zeros_like(best.fit.point.z)
+    ends = [share * end for end in (unit.low, unit.high) for share in _ALONG]
+    starts = [Point(centre, {**kept, unit: unit.inside(strength)}) for strength in ends]
+    wide = refit(sets[0].differing(WIDE), starts, race=best.fit.cost)
+    nearest = min(wide, key=lambda fit: fit.cost).point
+    return judged(*sets, refit(sets[0], [nearest]))
+
+
+def _sticking(
+    sets: tuple[Objective, Objective], best: Model, name: str, units: Sequence[Unit]
+) -> list[Model]:
+    """Return dry friction of every joint beside a servo's dead band that leaves more than noise.
+
+    Both make a servo stand still: alone, one takes nearly all of what the other does.
+    """
+    mine = [u for u in best.units if u.name == name and isinstance(u.effect, ServoDeadBand)]
+    dry = [u for u in units if isinstance(u.effect, CoulombFriction) and u.where != "all"]
+    known = {u.name for u in best.units}
+    if not mine or known & {u.name for u in dry} or best.dispersion() < _MORE:
+        return []
+    more = {unit: unit.inside(_LITTLE * unit.high) for unit in dry}
+    start = Point(best.fit.point.z, {**best.fit.point.strengths, **more})
+    return judged(*sets, refit(sets[0], [start]))
 
 
 def _nearer(

@@ -52,7 +52,7 @@ def baseless(effect: Finding, units: Sequence[Unit]) -> bool:
 
 
 def _ends(units: Sequence[Unit]) -> dict[tuple[str, str], tuple[float, float]]:
-    return {(u.name, u.where): (u.actual(u.low), u.actual(u.high)) for u in units}
+    return {(u.name, u.where): (round(u.actual(u.low), 12), u.actual(u.high)) for u in units}
 
 
 def _at_end(strength: float, ends: tuple[float, float]) -> bool:
@@ -70,7 +70,7 @@ def _of_strength(effect: Finding, ends: dict[tuple[str, str], tuple[float, float
                 f"{name} at {place} was fitted to {strength:.3g} {unit}, the end of what is looked "
                 f"for, [{low:.3g}, {high:.3g}]: there is more of it, or it stands for another cause"
             )
-    low, high = effect.ci95
+    low, high = np.round(effect.ci95, 12)
     if low <= 0 <= high:
         texts.append(
             f"{name} at {effect.where} may be nothing: its interval, [{low:.2g}, {high:.2g}] "

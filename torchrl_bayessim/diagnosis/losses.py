@@ -25,10 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..effects.action import PacketDrop
+from ..effects.contacts import ContactFriction
 from ..effects.sensors import SensorDropout
 from .chance import Chance
 from .contacts import resting
 from .loss_law import LossLaw, Told, Tried, likeliest
+from .model import Model
 from .modes import Mode
 from .objective import Objective, Point, Unit, strengths_of
 from .preparation import Prepared
@@ -49,6 +51,7 @@ _NUDGE = 0.2  # of the largest command
 _NEEDED, _LIKELY = 40.0, 6.0
 _EXPLAINED = 0.5  # of the excess of the segments concerned, by what is left of them
 _NOISE = 1.2  # scatter that noise has
+_LEFT = 2.0  # mean squared innovation of what has not explained the losses
 _OTHERS = 1 / 6  # of the segments that something else may have spoiled
 _REMAIN = 0.6  # or of those that were spoiled without losses
 _FEWEST = 4  # segments with a loss
@@ -176,7 +179,7 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
     nominal = _cut(prepared)
     best = {n: _Data.of(one.objective, selection.best.fit.point) for n, one in nominal.items()}
     rival = _Alone.of(best)
-    if selection.best.units and rival.calm:
+    if _explained(rival, selection.best):
         return []
     alone = _Alone.of(nominal)
     # what the best explanation without chance gains by the same standard
@@ -191,27 +194,32 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
     return [one for one in kept if one.gain > kept[0].gain - _LIKELY]
 
 
+def _explained(rival: _Alone, best: Model) -> bool:
+    """Return whether effects that last leave noise alone.
+
+    In short segments, where lost commands are hardly more than a lag, and in those of the search.
+    """
+    return bool(best.units) and rival.calm and best.dispersion() < _LEFT
+
+
 def _telling(prepared: Prepared, units: Sequence[Unit]) -> list[Unit]:
     """Return the units but for samples of what rests: it chatters, and one is like the next."""
-    sensing = prepared.predictor.sensing
-    still = resting(prepared.predictor, prepared.logs["train"], noise=prepared.noise)[
-        sensing.channels
-    ]
-    return [
-        u for u in units if isinstance(u.effect, PacketDrop) or not still[np.argmax(u.direction)]
-    ]
+    predictor = prepared.predictor
+    still = resting(predictor, prepared.logs["train"], noise=prepared.noise)
+    rests = still[predictor.sensing.channels]
+    return [u for u in units if isinstance(u.effect, PacketDrop) or not rests[u.direction.index(1)]]
 
 
 def _apart(unit: Unit, others: Sequence[Unit]) -> bool:
     """Return whether losses beside effects could not be another form of those.
 
-    A force law that is not quite the true one errs as a command would that was lost, and a lag that
-    is not as samples would.
+    A force law that is not quite the true one errs as a command would that was lost; a lag that is
+    not, and contacts that stick and slip a little otherwise, as samples would.
     """
-    samples = isinstance(unit.effect, SensorDropout)
-    return samples and not any(
-        other.effect.group == "timing" or other.effect.channel == "sensing" for other in others
-    )
+    known = [unit.effect for unit in others]
+    alike = any(e.group == "timing" or e.channel == "sensing" for e in known)
+    alike |= any(isinstance(e, ContactFriction) for e in known)
+    return isinstance(unit.effect, SensorDropout) and not alike
 
 
 def _all_found(data: Mapping[str, _Data], units: Sequence[Unit], alone: _Alone) -> list[Chance]:

@@ -13,6 +13,7 @@ from .objective import Objective, Point
 from .shrinkage import squares
 
 _ODD = 4.0  # times the error of a usual run, and times the noise
+_USUAL = 2.0  # noise floors of a usual run: of more, all runs depart
 
 
 def odd_runs(
@@ -20,8 +21,8 @@ def odd_runs(
 ) -> dict[str, float]:
     """Return the mean squared innovation of each odd run, by name.
 
-    A run is odd where it exceeds the noise floor, and the median of all runs, fourfold. Of fewer
-    than three runs none is.
+    A run is odd where it exceeds the noise floor, and the median of all runs, fourfold, and that
+    median is not far above the floor. Of fewer than three runs none is.
 
     Args:
         sets: Objectives by name of the split.
@@ -37,6 +38,8 @@ def odd_runs(
     if len(means) < 3:
         return {}
     usual = max(float(np.median([*means.values()])), 1.0)
+    if usual > _USUAL:
+        return {}
     return {name: mean for name, mean in means.items() if mean > _ODD * usual}
 
 

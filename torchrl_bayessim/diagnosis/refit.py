@@ -6,7 +6,7 @@ finite differences, which effects such as a delay or a dead band also have.
 
 from __future__ import annotations
 
-__all__ = ["Fit", "refit", "with_width"]
+__all__ = ["WIDE", "Fit", "refit", "with_width"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from .objective import Objective, Point, Unit
 
 Array = NDArray[np.float64]
 _BEHIND, _CHANCE = 1.5, 50.0  # times the best cost, and more: no rival of the best
-_WIDE = 0.25  # of a prior standard deviation, and of an effect's range
+WIDE = 0.25  # of a prior standard deviation, and of an effect's range
 _ROUGH = 0.5  # of what a wide step changes: how far off a narrow one may be
 _CATCHING_UP = 0.2  # of what is missing: what a step of a fit must gain to go on
 
@@ -172,13 +172,13 @@ def with_width(objective: Objective, point: Point) -> Objective:
     rows = np.eye(objective.size)[:-1]
     if not len(rows):
         return objective
-    moved = np.concatenate([objective.width * rows, _WIDE * rows])
+    moved = np.concatenate([objective.width * rows, WIDE * rows])
     ends = [Point(point.z + step) for step in moved]
     changes = objective([point, *ends])
     changes = (changes[1:] - changes[0]).reshape(2, len(rows), -1)
-    wrong = changes[0] * (_WIDE / objective.width) - changes[1]
+    wrong = changes[0] * (WIDE / objective.width) - changes[1]
     rough = np.linalg.norm(wrong) > _ROUGH * np.linalg.norm(changes[1])
-    return objective.differing(_WIDE) if rough else objective
+    return objective.differing(WIDE) if rough else objective
 
 
 def _outrun(descents: Sequence[LevenbergMarquardt], ahead: float) -> None:

@@ -11,7 +11,7 @@ from ..logs.system import System
 from .preparation import Prepared
 from .report import Candidate, Finding, Verdict
 from .shrinkage import Shrinkage
-from .validation import PARTIAL, SHOWN
+from .validation import NEGLIGIBLE, PARTIAL, SHOWN
 
 _WORSE = 1.2  # times the error as described, with parameters fitted to other runs
 _PLACE = 0.2  # of the error, to say that it sits there
@@ -54,7 +54,7 @@ def sentence(
     parameters = ""
     if system.prior is not None and measured.raw > measured.refit:
         share = (measured.raw - measured.refit) / max(measured.raw - 1.0, 1e-9)
-        parameters = f" Retuning parameters alone explains {_percent(share)}."
+        parameters = f" Retuning parameters alone explains {_percent(min(share, 1.0))}."
     elif measured.refit > _WORSE * measured.raw:
         parameters = (
             f" Retuning parameters alone makes test runs worse: {measured.raw:.3g} times the floor "
@@ -72,6 +72,8 @@ def sentence(
     share = f"explains {_percent(measured.explained)} [{100 * low:.0f}, {100 * high:.0f}] of it"
     if validated is not None:
         share = f"explains {_percent(validated)} of it on validation runs, test runs hardly show it"
+    elif measured.refit <= NEGLIGIBLE:
+        share = "found on other runs, too small to matter on test runs"
     if verdict == "ambiguous":
         others = ", ".join(confused)
         return (
@@ -79,7 +81,7 @@ def sentence(
             f"{share}.{parameters}{untested}"
         )
     text = f"{gap} Cause: {causes}, {share}"
-    partial = verdict != "named" and validated is None
+    partial = verdict != "named" and validated is None and measured.refit > NEGLIGIBLE
     text += f"; {_percent(1 - measured.explained)} remain." if partial else "."
     if len(confused) > 1:
         text += f" Not separable from: {', '.join(confused[1:])}."

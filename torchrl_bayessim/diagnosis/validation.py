@@ -5,13 +5,23 @@ Effects were chosen on them too, which flatters the share: so it must be larger,
 
 from __future__ import annotations
 
-__all__ = ["NAMED", "PARTIAL", "SHOWN", "SURE", "enough", "hardly_shown", "share_on_validation"]
+__all__ = [
+    "NAMED",
+    "NEGLIGIBLE",
+    "PARTIAL",
+    "SHOWN",
+    "SURE",
+    "enough",
+    "hardly_shown",
+    "share_on_validation",
+]
 
 from .selection import Selection
 from .shrinkage import Shrinkage
 
 PARTIAL = 0.4  # share of the gap that a cause explains at least
 NAMED = 0.8  # share of the gap that a cause without reserve explains
+NEGLIGIBLE = 1.05  # mean squared innovation: an excess over noise that no one would chase
 SHOWN = 1.2  # mean squared innovation of runs that show a gap
 SURE = 1e-5  # p-value of a gap that is there
 _LARGELY = 0.6  # share of such a gap that is enough

@@ -4,8 +4,8 @@ A goodness-of-fit test always rejects in the end, so the verdict weighs how larg
 how much of it the effects explain, not only whether it is significant::
 
     none           nothing significant, or an excess below 5 % of the noise floor
-    named          effects explain at least 80 %, and what is left is not significant, or 2 % and
-                   no more than the noise
+    named          effects explain at least 80 %, surely 40 %, and what is left is not significant,
+                   or 2 % and no more than the noise
     named_partial  effects explain at least 40 %; the rest is located. Or 80 % on validation runs,
                    where test runs hardly show the gap
     ambiguous      effects of different kinds explain the data equally well
@@ -30,9 +30,17 @@ from .report import Candidate, Finding, Verdict
 from .selection import Selection
 from .sentence import sentence
 from .shrinkage import Shrinkage
-from .validation import NAMED, PARTIAL, SHOWN, SURE, enough, hardly_shown, share_on_validation
+from .validation import (
+    NAMED,
+    NEGLIGIBLE,
+    PARTIAL,
+    SHOWN,
+    SURE,
+    enough,
+    hardly_shown,
+    share_on_validation,
+)
 
-_NEGLIGIBLE = 0.05  # of the noise floor: an excess that no one would chase
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
 _PLAIN = 4.0  # the same, to need no interval: few segments have a wide one, as about impacts
 _CERTAIN = 1e-15  # p-value of a gap that is too small to be seen at a glance
@@ -168,7 +176,7 @@ class _Weighed:
     def named(self, *, ambiguous: bool) -> Verdict:
         """Return the verdict on effects that were found."""
         measured = self.measured
-        if measured.refit - 1.0 <= _NEGLIGIBLE and measured.excess_ci[0] <= 0:
+        if measured.refit <= NEGLIGIBLE and measured.excess_ci[0] <= 0:
             # seen by the search, but too small to matter on the test runs
             return "named_partial" if self.significant else "none"
         if self.unsaid:
@@ -178,8 +186,8 @@ class _Weighed:
             return "ambiguous"
         # of a large gap, 2 % may be ten times the noise: proof that the law is another one
         nearly_all = measured.explained >= _ALL and measured.effects <= _NOISE_AGAIN
-        left = measured.remainder_ci[0] > _NEGLIGIBLE and not nearly_all
-        borne_out = measured.explained >= NAMED and measured.explained_ci[0] > 0
+        left = 1.0 + measured.remainder_ci[0] > NEGLIGIBLE and not nearly_all
+        borne_out = measured.explained >= NAMED and measured.explained_ci[0] >= PARTIAL
         return "named" if borne_out and not left else "named_partial"
 
 
