@@ -45,6 +45,8 @@ def candidates(
             ci = (strength - 1.96 * error, strength + 1.96 * error)
             before = float((selection.nominal.validation**2).sum())
             gain = before - float((model.validation**2).sum())
+            # a bent fit hides from its derivatives what a fit of the effect then shows
+            ratio = max(ratio, selection.nominal.fit.misfit - model.fit.misfit)  # noqa: PLW2901
         least = detectable[unit]
         result.append(
             Candidate(

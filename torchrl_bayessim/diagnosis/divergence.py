@@ -10,7 +10,7 @@ import numpy as np
 
 from .objective import Objective, Point
 
-HINT = "check masses, stiffnesses and the time step"
+HINT = "check masses, stiffnesses, the time step, and that angles are in radians"
 
 
 def divergence_alarms(objective: Objective, points: Mapping[str, Point]) -> list[str]:
