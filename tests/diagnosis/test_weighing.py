@@ -9,12 +9,12 @@ from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
 from torchrl_bayessim.diagnosis.verdict import _Weighed
 
 
-def verdict(*, refit, left, sure, chance=False, validation=(1.0, 1.0), interval=(-2.0, 1.0)):
+def verdict(*, refit, left, sure, chance=False, validation=(1.0, 1.0)):
     """Return the verdict on one effect: mean squared innovations of test runs and validation."""
     explained = (refit - left) / max(refit - 1.0, 1e-9)
     share = float(np.clip(explained, -1.0, 1.0))
     excess = (-0.2, 0.3) if refit < 1.05 else (0.5 * (refit - 1.0), 2 * refit)
-    measured = Shrinkage(9.0, refit, left, share, interval, excess, (left - 1.1, left - 0.9))
+    measured = Shrinkage(9.0, refit, left, share, (-2.0, 1.0), excess, (left - 1.1, left - 0.9))
     models = [
         SimpleNamespace(
             units=units,

@@ -95,7 +95,7 @@ def assemble(
         where=where,
         diverges=diverges_throughout(rollouts),
         odd=odd,
-        baseless=all(baseless(effect, units) for effect in found.effects),
+        baseless=baseless(found.effects, units),
         doubts=doubts(found.effects, units, prepared),
         alpha=alpha,
     )

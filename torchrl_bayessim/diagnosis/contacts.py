@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from ..logs.log import Log
 from .prediction import Predictor
-from .segments import Segments, cut_for_fits
+from .segments import Segments, cut_for_fits, of_velocities
 from .smoother import Beliefs, filtered, likeliest_share, unknown_forces
 from .whitening import start_deviations, whitening
 
@@ -131,29 +131,24 @@ def settled(predictor: Predictor, logs: Sequence[Log], *, theta: Array, noise: A
     forces = np.repeat(share**2 * unknown_forces(predictor)[None], len(logs), 0)
     states = filtered(predictor, logs, first, theta=theta, forces=forces, noise=noise).beliefs
     return [
-        _moved(touch, log, [_one(state, i) for state in states[: len(log)]], normals[i])
-        for i, log in enumerate(logs)
+        _moved(touch, log, states[: len(log)], i, normals=normals[i]) for i, log in enumerate(logs)
     ]
 
 
-def _one(state: Beliefs, i: int) -> Beliefs:
-    return Beliefs(state.qpos[i], state.qvel[i], state.covariance[i])
-
-
 def _moved(
-    touch: _Touch, log: Log, states: Sequence[Beliefs], normals: Sequence[Array | None]
+    touch: _Touch, log: Log, states: Sequence[Beliefs], i: int, *, normals: Sequence[Array | None]
 ) -> Log:
-    """Return the log with the steps to what a filter says of its contacts."""
+    """Return log ``i`` with the steps to what a filter says of its contacts."""
     size = 2 * touch.tangent.size
     step, free = np.zeros((len(log), size)), np.repeat(np.eye(size)[None], len(log), 0)
     error = np.zeros((len(log), size, size))
     for t, (state, some) in enumerate(zip(states, normals, strict=True)):
-        turned = touch.tangent.difference(log.qpos[t].numpy(), state.qpos)
-        apart = np.r_[turned, state.qvel - log.qvel[t].numpy()]
+        turned = touch.tangent.difference(log.qpos[t].numpy(), state.qpos[i])
+        apart = np.r_[turned, state.qvel[i] - log.qvel[t].numpy()]
         if some is not None and np.isfinite(apart).all():
             kept = touch.kept(some)
             step[t], free[t] = kept @ apart, np.eye(size) - kept
-            error[t] = kept @ state.covariance @ kept.T
+            error[t] = kept @ state.covariance[i] @ kept.T
     return replace(
         log,
         contact_step=torch.from_numpy(step),
@@ -184,10 +179,7 @@ class _Touch:
     @classmethod
     def of(cls, predictor: Predictor, logs: Sequence[Log], noise: Array) -> _Touch:
         """Return that of measured logs."""
-        gain = np.max([log.velocity_gain.numpy() for log in logs], axis=0)
-        errors = [o.velocity_error.numpy() for o in logs if o.velocity_error is not None]
-        worst = np.max([np.zeros(predictor.tangent.size), *errors], axis=0)
-        return cls(predictor, start_deviations(predictor.system, noise, gain, worst))
+        return cls(predictor, start_deviations(predictor.system, noise, *of_velocities(logs)))
 
     def along(self, log: Log) -> list[Array | None]:
         """Return the normals of contacts in joint space at every row, ``(c, nv)`` each."""

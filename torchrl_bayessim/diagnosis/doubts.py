@@ -29,7 +29,8 @@ def doubts(effects: Sequence[Finding], units: Sequence[Unit], prepared: Prepared
     """
     if not effects:
         return []
-    found = [text for effect in effects for text in _of_strength(effect, _ends(units))]
+    ends = _ends(units)
+    found = [text for effect in effects for text in _of_strength(effect, ends)]
     commands = [o.segments.ctrl for o in prepared.sets.values()]
     least, most = (np.array([f(one, axis=(0, 1)) for one in commands]) for f in (np.min, np.max))
     if least.size and (least.min(0) == most.max(0)).all():
@@ -39,15 +40,19 @@ def doubts(effects: Sequence[Finding], units: Sequence[Unit], prepared: Prepared
     return found
 
 
-def baseless(effect: Finding, units: Sequence[Unit]) -> bool:
-    """Return whether an effect may be nothing, and is at the end of what was looked for as well.
+def baseless(effects: Sequence[Finding], units: Sequence[Unit]) -> bool:
+    """Return whether every effect may be nothing, and is at the end of what was looked for as well.
 
     A wide interval alone may be that of a law without slope, such as a play that is all taken up.
     """
-    (low, high), ends = effect.ci95, _ends(units)
-    return low <= 0 <= high and all(
-        strength == 0 or _at_end(strength, ends.get((effect.name, place), _ANYTHING))
-        for place, strength in effect.strengths.items()
+    ends = _ends(units)
+    return all(
+        effect.ci95[0] <= 0 <= effect.ci95[1]
+        and all(
+            strength == 0 or _at_end(strength, ends.get((effect.name, place), _ANYTHING))
+            for place, strength in effect.strengths.items()
+        )
+        for effect in effects
     )
 
 

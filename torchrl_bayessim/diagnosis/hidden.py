@@ -89,9 +89,9 @@ class Hidden:
         starts = [self._hypotheses(predictor, log, noise) for log in logs]
         several = [log for log in logs for _ in range(_HYPOTHESES)]
         trial = {"rows": _TRIAL, "keep": False}
-        found = run(several, _joined(starts), [_USUAL] * len(several), **trial)
+        found = run(several, Beliefs.joined(starts), [_USUAL] * len(several), **trial)
         likeliest = found.likelihood.reshape(len(logs), -1).argmax(1)
-        first = _joined([_one(some, i) for some, i in zip(starts, likeliest, strict=True)])
+        first = Beliefs.joined([_one(some, i) for some, i in zip(starts, likeliest, strict=True)])
         share = likeliest_share(predictor, logs, first, theta=theta, noise=noise, rows=_TRIAL)
         whole = run(logs, first, [share] * len(logs))
         states = smoothed(predictor, whole, [len(log) for log in logs])
@@ -198,11 +198,6 @@ def _ranges(model: mujoco.MjModel, dofs: Sequence[int]) -> tuple[Array, Array]:
 
 def _initial(model: mujoco.MjModel) -> Array:
     return np.array(model.qpos0, dtype=np.float64)
-
-
-def _joined(beliefs: Sequence[Beliefs]) -> Beliefs:
-    return Beliefs(*(np.concatenate([getattr(b, n) for b in beliefs])
-                     for n in ("qpos", "qvel", "covariance")))  # fmt: skip
 
 
 def _one(beliefs: Beliefs, i: int) -> Beliefs:

@@ -173,7 +173,6 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
         units: Random effects at their targets; of those lost commands and samples of one target.
     """
     some = [u for u in units if isinstance(u.effect, PacketDrop | SensorDropout) and _single(u)]
-    some = _telling(prepared, some)
     if not some or type(prepared.mode) is not Mode:
         return []
     nominal = _cut(prepared)
@@ -181,6 +180,7 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
     rival = _Alone.of(best)
     if _explained(rival, selection.best):
         return []
+    some = _telling(prepared, some)
     alone = _Alone.of(nominal)
     # what the best explanation without chance gains by the same standard
     found, least = _all_found(nominal, some, alone), sum(alone.costs) - sum(rival.costs)

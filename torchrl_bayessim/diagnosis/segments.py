@@ -8,7 +8,7 @@ from which delay lines and filters know what came in.
 
 from __future__ import annotations
 
-__all__ = ["Segments", "cut", "cut_for_fits"]
+__all__ = ["Segments", "cut", "cut_for_fits", "of_velocities"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -154,8 +154,6 @@ def cut(
         return np.stack(parts)
 
     log, start = np.array(found, dtype=np.int64).T
-    gains = np.stack([one.velocity_gain.numpy() for one in logs])
-    errors = [o.velocity_error.numpy() for o in logs if o.velocity_error is not None]
     return Segments(
         horizon,
         history,
@@ -166,10 +164,16 @@ def cut(
         windows("qpos"),
         windows("qvel"),
         windows("ctrl"),
-        gains.max(0),
-        np.max([np.zeros(gains.shape[1]), *errors], axis=0),
+        *of_velocities(logs),
         **{name: _of_starts(logs, found, name) for name in _OF_STARTS},
     )
+
+
+def of_velocities(logs: Sequence[Log]) -> tuple[Array, Array]:
+    """Return the largest gain and error of estimated velocities in several logs, ``(nv,)`` each."""
+    gain = np.max([log.velocity_gain.numpy() for log in logs], axis=0)
+    errors = [log.velocity_error.numpy() for log in logs if log.velocity_error is not None]
+    return gain, np.max([np.zeros_like(gain), *errors], axis=0)
 
 
 def _of_starts(logs: Sequence[Log], found: Sequence[tuple[int, int]], name: str) -> Array | None:

@@ -48,6 +48,12 @@ class Beliefs:
     qvel: Array
     covariance: Array
 
+    @classmethod
+    def joined(cls, parts: Sequence[Beliefs]) -> Beliefs:
+        """Return several side by side."""
+        names = "qpos", "qvel", "covariance"
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
@@ -151,14 +157,11 @@ def likeliest_share(
         rows: At most so many of each log.
     """
     count = len(_SHARES)
-    every = Beliefs(
-        *(np.concatenate([part] * count) for part in (first.qpos, first.qvel, first.covariance))
-    )
     shares = np.repeat(_SHARES, len(logs))[:, None, None]
     found = filtered(
         predictor,
         list(logs) * count,
-        every,
+        Beliefs.joined([first] * count),
         theta=theta,
         forces=shares**2 * unknown_forces(predictor),
         noise=noise,
