@@ -129,6 +129,9 @@ def test_late_commands_stand_before_late_sensors_which_no_log_tells_apart():
         assert report.verdict == "named"
         assert [effect.name for effect in report.effects] == ["action_delay"]
         assert report.confusion_set == ("action_delay", "sensor_delay")
+        seats = report.where["channel"]  # the first of the two counts twice
+        assert seats["actuation"] == pytest.approx(2 / 3)
+        assert seats["sensing"] == pytest.approx(1 / 3)
         assert not report.next_experiment
 
 

@@ -9,12 +9,12 @@ from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
 from torchrl_bayessim.diagnosis.verdict import _Weighed
 
 
-def verdict(*, refit, left, sure, chance=False, validation=(1.0, 1.0)):
+def verdict(*, refit, left, sure, chance=False, validation=(1.0, 1.0), raw=9.0, ci=(-2.0, 1.0)):
     """Return the verdict on one effect: mean squared innovations of test runs and validation."""
     explained = (refit - left) / max(refit - 1.0, 1e-9)
     share = float(np.clip(explained, -1.0, 1.0))
     excess = (-0.2, 0.3) if refit < 1.05 else (0.5 * (refit - 1.0), 2 * refit)
-    measured = Shrinkage(9.0, refit, left, share, (-2.0, 1.0), excess, (left - 1.1, left - 0.9))
+    measured = Shrinkage(raw, refit, left, share, ci, excess, (left - 1.1, left - 0.9))
     models = [
         SimpleNamespace(
             units=units,
@@ -68,3 +68,9 @@ def test_a_cause_of_a_gap_too_small_to_show_must_help_somewhere(left, sure, vali
 @pytest.mark.parametrize(("left", "said"), [(11.0, "named_partial"), (23.0, "unknown")])
 def test_validation_runs_name_nothing_that_makes_test_runs_worse(left, said):
     assert verdict(refit=11.3, left=left, sure=1e-20, validation=(12.0, 2.0)) == said
+
+
+@pytest.mark.parametrize(("raw", "said"), [(9.0, "named"), (2.0, "named"), (1.2, "named_partial")])
+def test_a_share_of_an_error_that_fitting_made_larger_is_not_enough(raw, said):
+    answer = verdict(raw=raw, refit=9.0, left=1.1, sure=1e-20, validation=(9.0, 1.1), ci=(0.9, 1.0))
+    assert answer == said

@@ -33,7 +33,6 @@ from .preparation import Prepared
 from .report import Candidate, Finding, Gap, Parameter, Report
 from .rollout import rollout_errors
 from .scatter import Scatter
-from .screening import Screen
 from .selection import Selection
 from .shrinkage import Shrinkage, shrinkage
 from .verdict import conclude
@@ -79,7 +78,7 @@ def assemble(
     )
     seen = (*candidates(selection, found.confused, alpha), *scatter.candidates())
     parameters = _parameters(system, prepared, selection)
-    where, remainder = _locations(prepared, selection, credit)
+    where, remainder = _locations(prepared, selection, credit, found.confused)
     rollouts = rollout_errors(prepared, points)
     units = _every_unit(selection, scatter)
     odd = odd_runs(prepared.sets, prepared.logs, best.fit.point)
@@ -340,18 +339,21 @@ def _parameters(system: System, prepared: Prepared, selection: Selection) -> tup
 
 
 def _locations(
-    prepared: Prepared, selection: Selection, credit: Mapping[str, float]
+    prepared: Prepared,
+    selection: Selection,
+    credit: Mapping[str, float],
+    confused: Sequence[str],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return where the error sits before the effects, and after them."""
     train, judged = prepared.sets["train"], prepared.sets["validation"]
     found = unit_credit(selection, credit)
 
-    def where(model: Model, seen: Screen, gains: Mapping[Unit, float]) -> dict[str, Any]:
+    def left(model: Model) -> tuple[tuple[Objective, Array], tuple[Objective, Array]]:
         point = model.fit.point
-        return location((train, _raw(train, point)), (judged, _raw(judged, point)), seen, gains)
+        return (train, _raw(train, point)), (judged, _raw(judged, point))
 
-    before = where(selection.nominal, selection.screens[0], found)
-    after = where(selection.best, selection.screens[-1], {})
+    before = location(*left(selection.nominal), selection.screens[0], found, confused=confused)
+    after = location(*left(selection.best), selection.screens[-1], {})
     return before, after
 
 

@@ -25,6 +25,8 @@ def location(
     judged: tuple[Objective, Array],
     seen: Screen,
     found: Mapping[Unit, float],
+    *,
+    confused: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return shares of the excess error, by channel, output, joint, regime and time.
 
@@ -34,6 +36,8 @@ def location(
         seen: The signatures that the residuals are compared with.
         found: The effects that were named, with the error that each removes: they say more about
             channels and joints than any projection can.
+        confused: Names that cannot be told from the first of them, itself first. The error may
+            sit with any of these: they share its channel, which counts the first one twice.
     """
     robot = judged[0].predictor.system.robot
     beyond = excess(*judged)
@@ -49,8 +53,13 @@ def location(
     gains = dict(found) or _gains(seen)
     channels: dict[str, float] = dict.fromkeys(_CHANNELS, 0.0)
     joints = dict.fromkeys(robot.joints, 0.0)
+    rivals = {u.name: u.effect.channel for u in seen.units if u.name in confused}
     for unit, gain in gains.items():
-        channels[unit.effect.channel] += gain
+        perhaps = [unit.effect.channel]
+        if unit.name in confused[:1]:
+            perhaps += [rivals.get(name, unit.effect.channel) for name in confused]
+        for channel in perhaps:
+            channels[channel] += gain / len(perhaps)
         moved = [j for i, part in enumerate(unit.direction) if part
                  and (j := unit.effect.joint(robot, i)) >= 0]  # fmt: skip
         for joint in moved:

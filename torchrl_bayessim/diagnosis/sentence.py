@@ -13,7 +13,6 @@ from .report import Candidate, Finding, Verdict
 from .shrinkage import Shrinkage
 from .validation import NEGLIGIBLE, PARTIAL, SHOWN
 
-_WORSE = 1.2  # times the error as described, with parameters fitted to other runs
 _PLACE = 0.2  # of the error, to say that it sits there
 # what readers know a law by, beside its strength
 _FORMS = {"frequency": ", {:.3g} Hz", "number": ", {:.3g} per turn or 2π m"}
@@ -51,15 +50,7 @@ def sentence(
     gap = f"Gap: {measured.refit:.3g} times the noise floor on {prepared.horizon}-step prediction."
     ruled_out = _ruled_out(candidates)
     untested = _untested(candidates)
-    parameters = ""
-    if system.prior is not None and measured.raw > measured.refit:
-        share = (measured.raw - measured.refit) / max(measured.raw - 1.0, 1e-9)
-        parameters = f" Retuning parameters alone explains {_percent(min(share, 1.0))}."
-    elif measured.refit > _WORSE * measured.raw:
-        parameters = (
-            f" Retuning parameters alone makes test runs worse: {measured.raw:.3g} times the floor "
-            "as described."
-        )
+    parameters = _retuned(measured, fitted=system.prior is not None, found=verdict != "unknown")
     if verdict == "none":
         return f"{_no_gap(measured.refit)}{ruled_out}{untested}"
     if verdict == "not_testable":
@@ -86,6 +77,26 @@ def sentence(
     if len(confused) > 1:
         text += f" Not separable from: {', '.join(confused[1:])}."
     return f"{text}{parameters}{untested}"
+
+
+def _retuned(measured: Shrinkage, *, fitted: bool, found: bool) -> str:
+    """Return what fitting parameters alone does, and where it harms, what all of it together does.
+
+    >>> harmed = Shrinkage(3.0, 9.0, 2.0, 0.875, (0.8, 0.9), (7.0, 9.0), (0.9, 1.1))
+    >>> _retuned(harmed, fitted=True, found=True)  # doctest: +NORMALIZE_WHITESPACE
+    ' Retuning parameters alone makes test runs worse: 3 times the floor as described,
+    50 % of which parameters and effects explain together.'
+    """
+    if fitted and measured.raw > measured.refit:
+        share = (measured.raw - measured.refit) / max(measured.raw - 1.0, 1e-9)
+        return f" Retuning parameters alone explains {_percent(min(share, 1.0))}."
+    if not measured.misled:
+        return ""
+    together = f", {_percent(measured.of_raw)} of which parameters and effects explain together"
+    return (
+        f" Retuning parameters alone makes test runs worse: {measured.raw:.3g} times the floor "
+        f"as described{together if found and measured.raw > SHOWN else ''}."
+    )
 
 
 def _unknown(

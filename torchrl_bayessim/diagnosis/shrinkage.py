@@ -24,6 +24,7 @@ _FLOOR_ERROR = 0.05  # relative standard deviation of a noise floor, squared uni
 # Other motions differ by more than those of a few logs do. Of 86 robots whose cause was known and
 # named, 92 % had their true share in an interval so much wider, and never narrower; 73 % without.
 _OTHER_MOTIONS, _NARROWEST = 3.0, 0.01
+_WORSE = 1.2  # times the error as described, with parameters fitted to other runs
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,21 @@ class Shrinkage:
     explained_ci: tuple[float, float]
     excess_ci: tuple[float, float]
     remainder_ci: tuple[float, float]
+
+    @property
+    def misled(self) -> bool:
+        """Whether parameters that were fitted to other runs do worse than those as described."""
+        return self.refit > _WORSE * self.raw
+
+    @property
+    def of_raw(self) -> float:
+        """Share of the excess as described that parameters and effects remove together.
+
+        Example:
+            >>> Shrinkage(3.0, 9.0, 2.0, 0.875, (0.8, 0.9), (7.0, 9.0), (0.9, 1.1)).of_raw
+            0.5
+        """
+        return min((self.raw - self.effects) / (self.raw - 1.0), 1.0) if self.raw > 1.0 else 0.0
 
     @property
     def elsewhere(self) -> tuple[float, float]:

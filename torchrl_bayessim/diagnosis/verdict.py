@@ -188,6 +188,8 @@ class _Weighed:
         nearly_all = measured.explained >= _ALL and measured.effects <= _NOISE_AGAIN
         left = 1.0 + measured.remainder_ci[0] > NEGLIGIBLE and not nearly_all
         borne_out = measured.explained >= NAMED and measured.explained_ci[0] >= PARTIAL
+        # a share of an error that fitting made larger flatters the effects
+        borne_out &= not measured.misled or measured.of_raw >= NAMED
         return "named" if borne_out and not left else "named_partial"
 
 
