@@ -562,6 +562,11 @@ def test_servos_follow_their_commands():
     assert not kinds(check(*reversed(servo())))
     assert kinds(check(*reversed(servo(sign=-1)))) == {"action_sign"}
     assert kinds(check(*reversed(servo(scale=DEGREES)))) == {"action_scale"}
+    system, (record,) = servo()
+    turned = replace(record, qpos=DEGREES * record.qpos, qvel=DEGREES * record.qvel)
+    (finding,) = check([turned], system)[:1]
+    assert (finding.kind, finding.severity) == ("motion_scale", "error")
+    assert finding.message == "shoulder moves 51.8 times as far as its commands: in degrees?"
 
 
 def test_copies_short_logs_and_single_trajectories():

@@ -50,10 +50,13 @@ def check_forces(
     if any(not finding.file for finding in swapped):
         return
     moved = _without(moved, swapped)
+    # a servo says what its unit is: that of its commands
+    unlike = list(_check_commands(moved, model))
+    yield from unlike
+    moved = _without(moved, [finding for finding in unlike if finding.severity == "error"])
     odd = list(check_units(moved, system, half))
     yield from odd
     moved = _without(moved, odd)
-    usable = [(one.record, one.log) for one in moved]
     for joint, dof in actuated_joints(model):
         name = joint_names(model)[joint]
         fits = [
@@ -61,10 +64,7 @@ def check_forces(
             for one in moved
             if (fit := fit_terms(one.terms(dof), half=half))
         ]
-        servos = [i for i in range(model.nu) if is_servo(model, i, joint)]
-        if servos:
-            yield from _commands(name, joint, servos[0], usable=usable, model=model)
-        else:
+        if not _servos(model, joint):
             yield from _actions(name, [fit for *_, fit in fits])
             yield from _effort(name, [terms for _, _, terms, *_ in fits])
         if not fits:
@@ -140,6 +140,19 @@ def _effort(joint: str, fits: Sequence[Terms]) -> Iterator[Finding]:
         yield Finding(kind="effort", file="", rows=(0, 0), message=text)
 
 
+def _servos(model: mujoco.MjModel, joint: int) -> list[int]:
+    return [i for i in range(model.nu) if is_servo(model, i, joint)]
+
+
+def _check_commands(moved: Sequence[Dynamics], model: mujoco.MjModel) -> Iterator[Finding]:
+    """Find servos whose joint does not follow what is asked of it."""
+    usable = [(one.record, one.log) for one in moved]
+    for joint, _ in actuated_joints(model):
+        name = joint_names(model)[joint]
+        for actuator in _servos(model, joint)[:1]:
+            yield from _commands(name, joint, actuator, usable=usable, model=model)
+
+
 def _commands(
     joint: str,
     number: int,
@@ -157,6 +170,7 @@ def _commands(
             continue
         correlation = np.corrcoef(position, command)[0, 1]
         ratio = command.std() / position.std()
+        degrees = abs(abs(np.log(ratio)) - np.log(np.rad2deg(1.0))) < 0.3
         place = {"file": record.name, "rows": (0, len(record) - 1), "severity": "error"}
         if correlation < -0.9:
             text = f"{joint} moves against its commands: opposite sign?"
@@ -164,9 +178,12 @@ def _commands(
                 place["severity"] = "warning"
                 text = f"{joint} moves against its commands: too fast for it, or of opposite sign?"
             yield Finding(kind="action_sign", message=text, **place)
-        elif correlation > 0.9 and abs(np.log(ratio / np.rad2deg(1.0))) < 0.3:
+        elif correlation > 0.9 and degrees and ratio > 1:
             text = f"commands of {joint} are {ratio:.3g} times its motion: in degrees?"
             yield Finding(kind="action_scale", message=text, **place)
+        elif correlation > 0.9 and degrees:
+            text = f"{joint} moves {1 / ratio:.3g} times as far as its commands: in degrees?"
+            yield Finding(kind="motion_scale", message=text, **place)
 
 
 def _beyond_resonance(log: Log, joint: int, actuator: int, model: mujoco.MjModel) -> bool:
