@@ -78,11 +78,12 @@ def test_starts_in_contact_have_the_depth_that_the_simulator_has():
     found = settled(Predictor(system()), logs, theta=theta, noise=NOISE)
     before, after = [], []
     for log, (_, states) in zip(found, runs, strict=True):
-        assert log.contact_step is not None
+        assert log.touching is not None
+        step = log.touching.step
         wrong = log.qpos[:, 1].numpy() - states[:, 1]
         before.append(wrong[20:])
-        after.append((wrong + log.contact_step[:, 1].numpy())[20:])
-        assert not log.contact_step[:, [0, 2]].any()  # along the plane nothing is known better
+        after.append((wrong + step[:, 1])[20:])
+        assert not step[:, [0, 2]].any()  # along the plane nothing is known better
     assert np.sqrt(np.mean(np.square(after))) < 0.5 * np.sqrt(np.mean(np.square(before)))
 
 
@@ -93,8 +94,11 @@ def test_a_filter_is_believed_only_where_it_makes_predictions_likelier():
     right = settled(predictor, logs, **known)
     assert likelier(predictor, logs, right, **known)
     assert not likelier(predictor, right, logs, **known)
-    thrown = torch.tensor([0.0, 0.0, 0.0, 0.5]).double()  # m/s
-    wrong = [replace(log, contact_step=log.contact_step + thrown) for log in right]
+    thrown = np.array([0.0, 0.0, 0.0, 0.5])  # m/s
+    wrong = [
+        replace(log, touching=log.touching._replace(step=log.touching.step + thrown))
+        for log in right
+    ]
     assert not likelier(predictor, logs, wrong, **known)
 
 

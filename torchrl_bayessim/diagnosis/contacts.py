@@ -29,10 +29,10 @@ from dataclasses import replace
 
 import mujoco
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ..logs.log import Log
+from ..logs.touching import Touching
 from .prediction import Predictor
 from .segments import Segments, cut_for_fits, of_velocities
 from .smoother import Beliefs, filtered, likeliest_share, unknown_forces
@@ -149,12 +149,7 @@ def _moved(
             kept = touch.kept(some)
             step[t], free[t] = kept @ apart, np.eye(size) - kept
             error[t] = kept @ state.covariance[i] @ kept.T
-    return replace(
-        log,
-        contact_step=torch.from_numpy(step),
-        contact_free=torch.from_numpy(free),
-        contact_error=torch.from_numpy(error),
-    )
+    return replace(log, touching=Touching(step, free, error))
 
 
 class _Touch:

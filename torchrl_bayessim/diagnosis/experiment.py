@@ -175,9 +175,7 @@ def _played(prepared: Prepared, commands: Array, point: Point) -> Log | None:
         ctrl=torch.from_numpy(commands),
         first_row=0,
         uncertainty=None if known is None else known.mean(0, keepdim=True).expand(count, -1, -1),
-        contact_step=None,
-        contact_free=None,
-        contact_error=None,
+        touching=None,
     )
     whole = cut([rest], count - 1, history=prepared.sets["train"].segments.history)
     theta = prepared.sets["train"].theta(point.z[None])

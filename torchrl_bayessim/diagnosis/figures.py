@@ -167,9 +167,7 @@ def _shortened(segments: Segments) -> Segments:
         log=np.tile(segments.log, len(offsets)),
         start=np.concatenate([segments.start + o for o in offsets]),
         uncertainty=None if known is None else np.tile(known, (len(offsets), 1, 1)),
-        contact_step=None,  # of the first starts only
-        contact_free=None,
-        contact_error=None,
+        touching=None,  # of the first starts only
         **windows,
     )
 

@@ -44,7 +44,7 @@ def chosen_horizon(
     units = list({unit.name: unit for unit in units}.values())
     typical = float(np.median([len(log) for log in logs]))
     guessed = any(log.uncertainty is not None for log in logs)
-    filtered = any(log.contact_step is not None for log in logs)
+    filtered = any(log.touching is not None for log in logs)
     least = _UNSURE if guessed else _FILTERED if filtered else 0
     ladder = [steps for steps in _LADDER if steps >= least]
     best, choice = -np.inf, ladder[0]

@@ -210,8 +210,8 @@ class Predictor:
         if restored is not None:
             step[..., self.sensing.channels] = restored[:, :, at]
             step = segments.freed(step)
-        if segments.contact_step is not None:
-            step += segments.contact_step
+        if segments.touching is not None:
+            step += segments.touching.step
         if offsets is not None:
             step += offsets if offsets.ndim == 3 else offsets[:, None]
         half = self.tangent.size

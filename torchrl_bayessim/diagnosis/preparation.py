@@ -253,5 +253,5 @@ def _nominal(
 
 def _differing(objective: Objective, point: Point) -> Objective:
     """Return the objective with wide derivatives if contacts chatter in it."""
-    settled_there = objective.segments.contact_step is not None
+    settled_there = objective.segments.touching is not None
     return with_width(objective, point) if settled_there else objective

@@ -34,7 +34,7 @@ def gap_with_holds(prepared: Prepared, logs: Sequence[Log], selection: Selection
         return 1.0
     size = len(test.segments)
     whole = split(logs)["test"]
-    if test.segments.contact_step is not None:
+    if test.segments.touching is not None:
         theta = test.theta(selection.nominal.fit.point.z)
         whole = settled(prepared.predictor, whole, theta=theta, noise=prepared.noise)
     pieces = prepared.mode.cut(whole, prepared.horizon, history=test.segments.history, most=size)

@@ -15,14 +15,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..errors import message
 from ..logs.log import Log
+from ..logs.touching import Touching
 
 Array = NDArray[np.float64]
 _CHECKS = 10  # compared rows per segment
 _SKIP = 5  # control steps: the longest delay
-_OF_STARTS = "uncertainty", "contact_step", "contact_free", "contact_error"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +47,7 @@ class Segments:
         velocity_error: Of an estimated velocity, where motion is too fast for it, ``(nv,)``.
         uncertainty: Covariance of what was estimated of each start state, ``(S, 2 nv, 2 nv)``;
             nothing where all that matters was measured.
-        contact_step: From each measured start to one that contacts allow, ``(S, 2 nv)``; nothing
-            where nothing touches.
-        contact_free: What is left there of an error of the measured start, ``(S, 2 nv, 2 nv)``.
-        contact_error: Covariance of the rest of the errors there, ``(S, 2 nv, 2 nv)``.
+        touching: What contacts say of each measured start; nothing where nothing touches.
     """
 
     horizon: int
@@ -64,9 +62,7 @@ class Segments:
     velocity_gain: Array
     velocity_error: Array
     uncertainty: Array | None = None
-    contact_step: Array | None = None
-    contact_free: Array | None = None
-    contact_error: Array | None = None
+    touching: Touching | None = None
 
     def __len__(self) -> int:
         return len(self.start)
@@ -78,15 +74,17 @@ class Segments:
 
     def freed(self, steps: Array) -> Array:
         """Return what contacts leave of errors of measured starts, ``(*, S, 2 nv)``."""
-        if self.contact_free is None:
-            return steps
-        return np.einsum("sij,...sj->...si", self.contact_free, steps)
+        return steps if self.touching is None else self.touching.freed(steps)
 
     def take(self, index: NDArray[np.int64]) -> Segments:
         """Return some of the segments."""
-        names = "log", "start", "time", "qpos", "qvel", "ctrl", *_OF_STARTS
+        names = "log", "start", "time", "qpos", "qvel", "ctrl", "uncertainty"
         known = {n: getattr(self, n) for n in names if getattr(self, n) is not None}
-        return replace(self, **{n: values[index] for n, values in known.items()})
+        return replace(
+            self,
+            touching=None if self.touching is None else self.touching.take(index),
+            **{n: values[index] for n, values in known.items()},
+        )
 
 
 def cut(
@@ -165,7 +163,8 @@ def cut(
         windows("qvel"),
         windows("ctrl"),
         *of_velocities(logs),
-        **{name: _of_starts(logs, found, name) for name in _OF_STARTS},
+        uncertainty=_at(found, [log.uncertainty for log in logs]),
+        touching=_touching(found, [log.touching for log in logs]),
     )
 
 
@@ -176,12 +175,22 @@ def of_velocities(logs: Sequence[Log]) -> tuple[Array, Array]:
     return gain, np.max([np.zeros_like(gain), *errors], axis=0)
 
 
-def _of_starts(logs: Sequence[Log], found: Sequence[tuple[int, int]], name: str) -> Array | None:
-    """Return what is known of the starts, log ``i`` and row ``k`` each."""
-    known = [getattr(log, name) for log in logs if getattr(log, name) is not None]
-    if len(known) < len(logs):
+def _at(found: Sequence[tuple[int, int]], values: Sequence[Tensor | None]) -> Array | None:
+    """Return what is known of starts, log ``i`` and row ``k`` each; nothing unless of all logs."""
+    known = [one.numpy() for one in values if one is not None]
+    return np.stack([known[i][k] for i, k in found]) if len(known) == len(values) else None
+
+
+def _touching(
+    found: Sequence[tuple[int, int]], values: Sequence[Touching | None]
+) -> Touching | None:
+    """Return the same of contacts."""
+    known = [one for one in values if one is not None]
+    if len(known) < len(values):
         return None
-    return np.stack([known[i][k].numpy() for i, k in found])
+    return Touching(
+        *(np.stack([part[i][k] for i, k in found]) for part in zip(*known, strict=True))
+    )
 
 
 def cut_for_fits(logs: Sequence[Log], horizon: int, *, history: int, most: int) -> Segments:

@@ -176,8 +176,8 @@ def _start_noise(predictor: Predictor, segments: Segments, noise: Array) -> Arra
     steps = np.diag(start)[start > 0]
     steps = np.broadcast_to(steps[:, None], (len(steps), len(segments), 2 * size))
     roots = [segments.freed(steps)]
-    if segments.contact_error is not None:
-        roots.append(_roots(segments.contact_error))
+    if segments.touching is not None:
+        roots.append(_roots(segments.touching.error))
     if segments.uncertainty is not None:
         roots.append(_KNOWN * _roots(segments.uncertainty))  # so does an estimated position
     return np.concatenate(roots)

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from .touching import Touching
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Log:
@@ -28,10 +30,7 @@ class Log:
             the beginning of the trajectory is known.
         uncertainty: Covariance of the errors of what was estimated and not measured, in the tangent
             space, ``(T, 2 nv, 2 nv)``; nothing where all that matters was measured.
-        contact_step: From each measured state to one that contacts allow, in the tangent space,
-            ``(T, 2 nv)``; nothing where nothing touches.
-        contact_free: What is left there of an error of the measured state, ``(T, 2 nv, 2 nv)``.
-        contact_error: Covariance of the rest of the errors there, ``(T, 2 nv, 2 nv)``.
+        touching: What contacts say of each state; nothing where nothing touches.
 
     All tensors of numbers are in double precision.
     """
@@ -46,9 +45,7 @@ class Log:
     first_row: int = 0
     velocity_error: Tensor | None = None
     uncertainty: Tensor | None = None
-    contact_step: Tensor | None = None
-    contact_free: Tensor | None = None
-    contact_error: Tensor | None = None
+    touching: Touching | None = None
 
     def __len__(self) -> int:
         return len(self.time)
