@@ -105,3 +105,21 @@ def test_an_estimated_velocity_is_estimated_from_bridged_positions():
     assert hold.share == pytest.approx(0.2, abs=0.06)
     assert not torch.equal(bridge.qvel, log.qvel)
     assert float((bridge.qvel - log.qvel).abs().median()) < 0.3
+
+
+def test_noise_hides_whether_what_is_late_varies():
+    rng = np.random.default_rng(5)
+
+    def jittered(u, k):  # by up to a step
+        return u[k] + rng.random() * (u[max(k - 1, 0)] - u[k])
+
+    report = diagnose(system(), None, logs(act=jittered), effects=SOME)
+    assert report.effects[0].name == "action_delay"
+    assert "action_jitter" in report.confusion_set
+    assert "confounded" in status(report, "action_jitter")
+
+
+def test_a_delay_of_several_steps_does_not_vary():
+    report = diagnose(system(), None, logs(act=lambda u, k: u[max(k - 3, 0)]), effects=SOME)
+    assert report.effects[0].name == "action_delay"
+    assert "action_jitter" not in report.confusion_set

@@ -185,6 +185,8 @@ def _with_chance(
                 effects=(*found.effects, *scatter.findings(measured, robot, others=others)),
                 strengths={**found.strengths, **scatter.strengths(robot)},
             )
+    elif scatter.hidden:
+        found = replace(found, confused=(*found.confused, *scatter.hidden))
     elif scatter.found:
         measured = scatter.measured(found.measured, generator)
         effects = scatter.findings(measured, robot)

@@ -14,7 +14,7 @@ leaves errors too, so an effect of chance must leave noise alone by its own stan
 
 from __future__ import annotations
 
-__all__ = ["Chance", "chances", "detectable", "of_chance"]
+__all__ = ["Chance", "chances", "detectable", "of_chance", "unseen"]
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 _DRAWS, _FEW = 12, 4  # simulations of each candidate, and of what is only to be ruled out
 _MANY = 60  # of what is named: a scatter that fewer do not span would count as left
 _LEVELS = (0.08, 0.2, 0.45, 1.0)  # of an effect's range
+_FINER = np.geomspace(_LEVELS[0], _LEVELS[-1], 10)
+_LATE = "timing"  # the group of effects that are late
 _AROUND = (0.65, 0.8, 1.25, 1.55)  # times the best of these
 _SCATTER = np.geomspace(0.6, 4.0, 20)  # φ
 _WHITE = 1.15  # mean squared innovation of a model that leaves nothing to chance
@@ -167,12 +169,8 @@ def chances(
         return []
     point = selection.nominal.fit.point
     judged = [_Data.of(sets[name], point) for name in ("train", "validation")]
-    rows = [(unit, level * unit.high) for unit in units for level in _LEVELS]
     base = _without(judged, selection.best.fit.point)
-    told = _told(judged, [Point(point.z, {unit: strength}) for unit, strength in rows])
-    best: dict[Unit, tuple[float, float]] = {}
-    for (unit, strength), one in zip(rows, told, strict=True):
-        best[unit] = min(best.get(unit, (np.inf, 0.0)), (one.cost, strength))
+    best = _likeliest(judged, point, [(u, level * u.high) for u in units for level in _LEVELS])
     least = min(cost for cost, _ in best.values())
     if base.sum() - least < _NEEDED:
         return []
@@ -187,9 +185,42 @@ def chances(
     return sorted(found, key=lambda c: -c.gain)
 
 
+def unseen(sets: Mapping[str, Objective], selection: Selection, units: Sequence[Unit]) -> list[str]:
+    """Return the names of random effects that what was found to be late may be in truth.
+
+    What is late by another time at each step is late on average, and where noise hides its scatter
+    as likely as a delay.
+
+    Args:
+        sets: Training, validation and test segments.
+        selection: What the search without chance found, and nothing of chance did better.
+        units: Random effects at their targets.
+    """
+    found = selection.best.units
+    alike = [unit for unit in units if unit.effect.group == _LATE]
+    if not found or not alike or any(unit.effect.group != _LATE for unit in found):
+        return []
+    point = selection.nominal.fit.point
+    judged = [_Data.of(sets[name], point) for name in ("train", "validation")]
+    most = float(_without(judged, selection.best.fit.point).sum()) + _LIKELY
+    best = _likeliest(judged, point, [(u, level * u.high) for u in alike for level in _FINER])
+    return list(dict.fromkeys(unit.name for unit, (cost, _) in best.items() if cost < most))
+
+
+def _likeliest(
+    judged: Sequence[_Data], point: Point, rows: Sequence[tuple[Unit, float]]
+) -> dict[Unit, tuple[float, float]]:
+    """Return the least deviance of each unit over strengths, and the strength that has it."""
+    told = _told(judged, [Point(point.z, {unit: strength}) for unit, strength in rows])
+    best: dict[Unit, tuple[float, float]] = {}
+    for (unit, strength), one in zip(rows, told, strict=True):
+        best[unit] = min(best.get(unit, (np.inf, 0.0)), (one.cost, strength))
+    return best
+
+
 def _calm(selection: Selection) -> bool:
     best = selection.best
-    if any(unit.effect.group == "timing" for unit in best.units):
+    if any(unit.effect.group == _LATE for unit in best.units):
         return False  # what varies is late on average
     return max(float((best.fit.innovations**2).mean()), best.dispersion()) < _WHITE
 

@@ -25,7 +25,7 @@ from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
 from ..physics.mujoco import MujocoPhysics
 from .assembly import assemble
-from .chance import chances, detectable, of_chance
+from .chance import chances, detectable, of_chance, unseen
 from .holds import bridged
 from .losses import losses
 from .modes import MODES
@@ -116,6 +116,7 @@ def diagnose(
         random = of_chance(every)
         progress("looking for scatter")
         found = losses(prepared, selection, every) or chances(prepared.sets, selection, random)
+        hidden = [] if found else unseen(prepared.sets, selection, random)
         least = detectable(prepared.sets["train"], selection, random)
         progress("opening the test runs")
         return assemble(
@@ -127,6 +128,7 @@ def diagnose(
                 least,
                 holds,
                 gap_with_holds(prepared, logs, selection) if holds else 1.0,
+                hidden,
             ),
             findings=findings,
             generator=generator,

@@ -53,12 +53,14 @@ class Scatter:
         least: Of each that was looked for, the least strength that would have been seen.
         holds: Channels whose samples were not always renewed.
         held: Mean squared innovation of test segments with the samples as they were recorded.
+        hidden: Names of those that what was found to be late may be in truth.
     """
 
     found: Sequence[Chance]
     least: Mapping[Unit, float]
     holds: Sequence[Hold]
     held: float
+    hidden: Sequence[str] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -209,6 +211,8 @@ class Scatter:
         if self._known(unit)[0]:
             held = unit.name == SensorDropout.name and self.holds
             return "named" if held or unit == self.found[0].unit else "confounded"
+        if unit.name in self.hidden:
+            return "confounded"
         if self.found or (self.holds and unit.name == SensorDropout.name):
             return "rejected"
         return "ruled_out" if np.isfinite(least) else "not_excited"
