@@ -72,6 +72,17 @@ def test_rare_losses_of_commands_are_counted(share):
     assert explained(report) > 0.5
 
 
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_frequent_losses_of_commands_are_counted_though_not_all_patterns_are_tried(share):
+    report = diagnose(
+        system(), None, logs(8, act=rough(share, np.random.default_rng(1))), effects=SOME
+    )
+    (found,) = report.effects
+    assert found.name == "packet_drop"
+    assert found.ci95[0] < share < found.ci95[1]
+    assert found.ci95[1] - found.ci95[0] < 0.6 * share
+
+
 @pytest.mark.parametrize("share", [0.02, 0.1])
 def test_samples_that_are_not_renewed_are_counted_though_they_never_repeat(share):
     rng = np.random.default_rng(2)
@@ -81,6 +92,7 @@ def test_samples_that_are_not_renewed_are_counted_though_they_never_repeat(share
     (found,) = report.effects
     assert (found.name, found.where) == ("sensor_dropout", "hinge position")
     assert found.strength == pytest.approx(share, rel=0.5)
+    assert found.ci95[0] < share < found.ci95[1]
     assert explained(report) > 0.8
 
 
@@ -148,7 +160,7 @@ def test_the_likeliest_law_of_a_grid_is_the_one_of_least_deviance_by_the_definit
         total = 0.0
         for part in parts:
             s, phi = law.share, law.scatter
-            prior = s**lost * (1 - s) ** (3 - lost)
+            prior = s**lost * (1 - s) ** (3 - lost) / (1 - s**3)  # three losses are not tried
             normal = (phi * np.exp(part.squares / phi)) ** (-0.5 * law.size)
             wide = [
                 (k * phi * np.exp(part.squares[0] / (k * phi))) ** (-0.5 * law.size)

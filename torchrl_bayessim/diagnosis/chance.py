@@ -42,6 +42,7 @@ _CALM = 1.3  # φ beyond which an effect of chance has not explained the scatter
 _SEGMENTS = 8  # of each split
 _APART = 4  # targets of one effect that are looked at singly
 _SURE = 1.5  # standard errors of segments by which the mean gain exceeds zero
+_LEAST = 0.3  # relative error of a strength: so few draws do not span what chance may do
 _NEEDED, _LIKELY = 20.0, 6.0  # deviances: to be found, and that chance often makes
 
 
@@ -326,4 +327,4 @@ def _error(logs: Array, costs: Array) -> float:
     if len(logs) < 3:
         return 0.5
     curve = float(np.polyfit(logs, costs, 2)[0])
-    return float(np.clip(1 / np.sqrt(max(curve, 1e-9)), 0.02, 0.5))
+    return float(np.clip(1 / np.sqrt(max(curve, 1e-9)), _LEAST, 0.5))

@@ -3,9 +3,10 @@
 With ``ε_b`` the ``M`` innovations of a segment if the pattern ``b`` of its ``H`` values was lost,
 ``s`` the probability of a loss, ``φ`` the scatter, the segment has the density::
 
-    p(ε) = (1 - η) Σ_b s^|b| (1 - s)^(H - |b|) N(ε_b; 0, φ I) + η N(ε; 0, κ φ I).
+    p(ε) = (1 - η) Σ_b s^|b| (1 - s)^(H - |b|) / P(|b| ≤ B) N(ε_b; 0, φ I) + η N(ε; 0, κ φ I).
 
-The second part is of segments that something else has spoiled, such as a contact that was missed.
+Patterns of more than ``B`` losses are too many to be tried. The second part is of segments that
+something else has spoiled, such as a contact that was missed.
 """
 
 from __future__ import annotations
@@ -19,8 +20,11 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp, softmax, xlog1py, xlogy
+from scipy.stats import binom, chi2
 
 Array = NDArray[np.float64]
+_FINER = np.geomspace(0.25, 4.0, 120)  # times the share of a coarse grid
+_MOST = 0.95  # of a share
 _WIDER = np.array([4.0, 16.0, 64.0, 256.0])  # κ, each as likely
 
 
@@ -96,6 +100,23 @@ class LossLaw:
         grid = [self.share], [self.scatter], [self.spoiled]
         return float(_deviances(parts, *grid, size=self.size).item())
 
+    def share_within(self, parts: Sequence[Tried]) -> tuple[float, float, float]:
+        """Return the likeliest share, and the ends of its 95 % interval by the likelihood ratio.
+
+        Example:
+            >>> law = LossLaw(share=0.15, scatter=1.0, spoiled=0.01, size=20)
+            >>> squares = np.full((6, 40), 9.0)
+            >>> squares[0, :20] = squares[3, 20:] = 1.0  # every other segment has a loss
+            >>> tried = Tried(squares, np.array([0, 1, 1, 1, 1, 1]), values=5)
+            >>> np.round(law.share_within([tried]), 2)
+            array([0.17, 0.1 , 0.27])
+        """
+        shares = np.minimum(_FINER * self.share, _MOST)
+        grid = shares.tolist(), [self.scatter], [self.spoiled]
+        values = _deviances(parts, *grid, size=self.size).ravel()
+        likely = shares[values < values.min() + chi2.ppf(0.95, 1)]
+        return float(shares[values.argmin()]), float(likely[0]), float(likely[-1])
+
     def told(self, tried: Tried) -> Told:
         """Return what segments say of their losses."""
         likely = softmax(self._logs(tried), axis=0)
@@ -110,9 +131,7 @@ class LossLaw:
 
     def _logs(self, tried: Tried) -> Array:
         """Return log densities of every pattern and of spoiled segments, shape ``(B + 1, S)``."""
-        prior = np.add(
-            xlogy(tried.lost, self.share), xlog1py(tried.values - tried.lost, -self.share)
-        )
+        prior = _prior(tried.lost, np.array(self.share), tried)
         own = _normal(tried.squares, np.array(self.scatter), self.size)
         own += (np.log1p(-self.spoiled) + prior)[:, None]
         wide = _wide(tried, np.array(self.scatter), self.size)
@@ -163,11 +182,17 @@ def _deviances(
         normal = _normal(tried.squares, scatter[..., None], size)
         counts = np.unique(tried.lost)
         each = [_total(normal[:, tried.lost == count], axis=1) for count in counts]
-        prior = xlogy(counts, share) + xlog1py(tried.values - counts, -share)
+        prior = _prior(counts, share, tried)
         own = _total(np.stack(each, 1) + prior[:, None, :, None], axis=2)[:, :, None]
         wide = _wide(tried, scatter, size)[:, None]
         total += np.logaddexp(np.log1p(-eta) + own, np.log(eta) + wide).sum(-1)
     return -2.0 * total
+
+
+def _prior(lost: NDArray[np.int64], share: Array, tried: Tried) -> Array:
+    """Return the log probability of a pattern of so many losses, among those that were tried."""
+    each = xlogy(lost, share) + xlog1py(tried.values - lost, -share)
+    return np.asarray(each - binom.logcdf(tried.lost.max(), tried.values, share))
 
 
 def _wide(tried: Tried, scatter: Array, size: int) -> Array:
