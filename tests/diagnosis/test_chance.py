@@ -123,3 +123,15 @@ def test_a_delay_of_several_steps_does_not_vary():
     report = diagnose(system(), None, logs(act=lambda u, k: u[max(k - 3, 0)]), effects=SOME)
     assert report.effects[0].name == "action_delay"
     assert "action_jitter" not in report.confusion_set
+
+
+def test_next_to_nothing_is_named_beside_held_samples():
+    """A limit that is hardly touched mends a little of what bridges over held samples leave."""
+    rng = np.random.default_rng(7)
+    data = logs(8, act=lambda u, k: float(np.clip(u[k], -3.9, 3.9)))
+    some = [held(log, 0.1, rng, "qpos", "qvel") for log in data]
+    report = diagnose(system(), None, some, effects=("saturation", "sensor_dropout"))
+    assert report.effects[0].name == "sensor_dropout"
+    assert report.confusion_set[0] == "sensor_dropout"
+    for effect in report.effects[1:]:
+        assert effect.share_of_gap >= 0.01

@@ -1,6 +1,7 @@
 """Small robots whose cause is known; the generator steps MuJoCo itself."""
 
 import json
+import re
 from dataclasses import replace
 
 import mujoco
@@ -120,6 +121,32 @@ def test_a_gap_that_nothing_explains_is_not_called_none():
     assert report.verdict == "unknown"
     assert not report.effects
     assert "It is real, but none of the 2 effects" in str(report)
+
+
+def test_a_smaller_cause_is_named_beside_a_larger_one():
+    """A fortieth of what the constant force explains, and several times the noise."""
+    data = logs(push=lambda q, v: 0.3 - 0.1 * np.tanh(v / 0.01))
+    effects = "constant_force", "coulomb_friction", "sensor_drift", "action_gain"
+    report = diagnose(system(), None, data, effects=effects)
+    found = {effect.name: effect.strength for effect in report.effects}
+    assert found["constant_force"] == pytest.approx(0.3, rel=0.1)
+    assert found["coulomb_friction"] == pytest.approx(0.1, rel=0.2)
+
+
+def test_nothing_is_ruled_out_while_something_is_missing():
+    data = logs(push=lambda q, v: -0.4 * np.sin(3 * q) * np.sign(v))
+    effects = "quadratic_drag", "parallel_spring", "action_bias"
+    report = diagnose(system(), None, data, effects=effects)
+    assert report.gap.with_effects > 1.5
+    assert "ruled_out" not in {c.status for c in report.candidates}
+    others = [c for c in report.candidates if c.status != "named"]
+    assert {c.minimal_detectable_strength for c in others} == {None}
+
+
+def test_where_there_is_no_gap_nothing_explains_it():
+    report = diagnose(system(), None, logs(), effects=SOME)
+    assert {c.explained_fraction for c in report.candidates} == {0.0}
+    assert re.search(r"Ruled out: [a-z ]+ above [\d.e-]+ (N m|rad/s|rad|s|fraction) ", str(report))
 
 
 def test_late_commands_stand_before_late_sensors_which_no_log_tells_apart():

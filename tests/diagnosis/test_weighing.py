@@ -9,7 +9,9 @@ from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
 from torchrl_bayessim.diagnosis.verdict import _Weighed
 
 
-def verdict(*, refit, left, sure, chance=False, validation=(1.0, 1.0), raw=9.0, ci=(-2.0, 1.0)):
+def verdict(
+    *, refit, left, sure, chance=False, validation=(1.0, 1.0), raw=9.0, ci=(-2.0, 1.0), count=1
+):
     """Return the verdict on one effect: mean squared innovations of test runs and validation."""
     explained = (refit - left) / max(refit - 1.0, 1e-9)
     share = float(np.clip(explained, -1.0, 1.0))
@@ -31,7 +33,7 @@ def verdict(*, refit, left, sure, chance=False, validation=(1.0, 1.0), raw=9.0, 
     weighed = _Weighed.of(
         found,
         measured,
-        [SimpleNamespace(p_value=sure)],
+        [SimpleNamespace(p_value=sure)] * count,
         scattered={"losses"} if chance else set(),
         alpha=0.01,
     )
@@ -73,4 +75,16 @@ def test_validation_runs_name_nothing_that_makes_test_runs_worse(left, said):
 @pytest.mark.parametrize(("raw", "said"), [(9.0, "named"), (2.0, "named"), (1.2, "named_partial")])
 def test_a_share_of_an_error_that_fitting_made_larger_is_not_enough(raw, said):
     answer = verdict(raw=raw, refit=9.0, left=1.1, sure=1e-20, validation=(9.0, 1.1), ci=(0.9, 1.0))
+    assert answer == said
+
+
+@pytest.mark.parametrize(
+    ("count", "left", "said"),
+    [(1, 1.9, "named"), (1, 2.1, "named_partial"), (2, 1.9, "named_partial"), (2, 1.15, "named")],
+)
+def test_two_effects_may_leave_less_than_one(count, left, said):
+    answer = verdict(
+        refit=200.0, raw=300.0, left=left, sure=1e-20, validation=(9.0, 1.1), ci=(0.9, 1.0),
+        count=count,
+    )  # fmt: skip
     assert answer == said

@@ -17,7 +17,7 @@ from ..effects.effect import Effect
 from ..effects.joints import CoulombFriction
 from ..effects.transmission import ServoDeadBand
 from .explanations import compare
-from .model import LIKELY, Model, criterion, gain, judged, needed
+from .model import LIKELY, Model, as_good, criterion, gain, judged, needed
 from .objective import Objective, Point, Unit
 from .refit import WIDE, refit
 from .screening import Screen
@@ -159,4 +159,6 @@ def exchanged(best: Model, others: Mapping[str, Sequence[Model]]) -> Model:
     ]
     first = min([best, *candidates], key=lambda m: criterion(m, best.dispersion()))
     better_by = criterion(best, best.dispersion()) - criterion(first, best.dispersion())
+    if len(first.units) > len(best.units) and as_good(first, best):
+        return best  # something is wrong with both, and more strengths mend more of it
     return first if better_by > LIKELY else best

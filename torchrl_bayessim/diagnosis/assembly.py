@@ -18,9 +18,9 @@ from ..effects.sensors import SensorDropout
 from ..effects.units import unit_at
 from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
-from .candidates import candidates, strength_errors
+from .candidates import candidates, concluded, strength_errors
 from .confusion import confusion_set, settled
-from .credit import apart, credit_of, unit_credit
+from .credit import credit_of, unit_credit, worthwhile
 from .divergence import divergence_alarms, diverges_throughout
 from .doubts import baseless, doubts
 from .experiment import experiments
@@ -31,7 +31,7 @@ from .objective import Objective, Point, Unit, strengths_of
 from .odd_runs import odd_run_alarms, odd_runs
 from .preparation import Prepared
 from .report import Candidate, Finding, Gap, Parameter, Report
-from .rollout import rollout_errors
+from .rollout import rollout_errors, worse_rollouts
 from .scatter import Scatter
 from .selection import Selection
 from .shrinkage import Shrinkage, shrinkage
@@ -64,7 +64,7 @@ def assemble(
         begun: When the diagnosis began, by ``time.perf_counter``.
         alpha: Level of the tests.
     """
-    selection = apart(selection, prepared.sets)
+    selection = worthwhile(selection, prepared.sets)
     credit = credit_of(selection)
     if credit:
         selection = settled(selection, max(credit, key=credit.__getitem__), prepared.sets)
@@ -76,7 +76,10 @@ def assemble(
         system.robot,
         generator,
     )
-    seen = (*candidates(selection, found.confused, alpha), *scatter.candidates())
+    seen = (
+        *candidates(selection, found.confused, system.robot, alpha),
+        *scatter.candidates(system.robot),
+    )
     parameters = _parameters(system, prepared, selection)
     where, remainder = _locations(prepared, selection, credit, found.confused)
     rollouts = rollout_errors(prepared, points)
@@ -101,13 +104,17 @@ def assemble(
     if verdict in {"none", "unknown", "not_testable"}:
         # what little was tried is among the candidates
         found = replace(found, effects=(), strengths={}, confused=())
-        seen = tuple(replace(c, status="rejected") if c.status == "named" else c for c in seen)
+    names, measured = {effect.name for effect in found.effects}, found.measured
+    left = measured.effects if names else measured.refit
+    seen = concluded(seen, verdict, names, left=left)
     alarms = [*prepared.alarms, *(str(f) for f in findings), *_absorbed(parameters)]
     alarms += odd_run_alarms(odd)
     named = ["as described", "with fitted parameters", "with the effects"][: 2 + bool(best.units)]
     alarms += divergence_alarms(
         prepared.sets["test"], dict(zip(named, points.values(), strict=False))
     )
+    if names:
+        alarms += worse_rollouts(rollouts)
     return Report(
         verdict=verdict,
         summary=summary,
@@ -191,18 +198,28 @@ def _with_chance(
         measured = scatter.measured(found.measured, generator)
         effects = scatter.findings(measured, robot)
         found = _Found(measured, effects, scatter.strengths(robot), scatter.names)
-    if scatter.holds:
-        measured = scatter.with_holds(found.measured)
-        if measured.explained - found.measured.explained > _WORTH:
-            others = sum(effect.share_of_gap for effect in found.effects)
-            held = scatter.held_findings(measured, others)
-            found = _Found(
-                measured,
-                (*found.effects, *held),
-                {**found.strengths, SensorDropout(): dict(held[0].strengths)},
-                found.confused or tuple(f.name for f in held),
-            )
-    return found
+    return _with_holds(found, scatter) if scatter.holds else found
+
+
+def _with_holds(found: _Found, scatter: Scatter) -> _Found:
+    """Return the same with samples that were not renewed, of the gap as it was recorded.
+
+    What explains next to nothing of that is a stopgap for what bridges leave.
+    """
+    measured, before = scatter.with_holds(found.measured), found.measured
+    gap = max(measured.refit - 1.0, 1e-9)
+    if measured.refit - before.refit <= _WORTH * gap:
+        return found
+    lasting, strengths, confused = found.effects, found.strengths, found.confused
+    if before.refit - before.effects <= _WORTH * gap:
+        lasting, strengths, confused = (), {}, ()
+    smaller = max(before.refit - 1.0, 0.0) / gap
+    lasting = tuple(replace(e, share_of_gap=smaller * e.share_of_gap) for e in lasting)
+    (held,) = scatter.held_findings(measured, sum(e.share_of_gap for e in lasting))
+    effects = sorted([*lasting, held], key=lambda e: -e.share_of_gap)
+    first = effects[0] is held or not confused
+    strengths = {**strengths, SensorDropout(): dict(held.strengths)}
+    return _Found(measured, tuple(effects), strengths, (held.name,) if first else confused)
 
 
 def _absorbed(parameters: Sequence[Parameter]) -> list[str]:

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-__all__ = ["candidates", "strength_errors"]
+__all__ = ["candidates", "concluded", "strength_errors"]
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from ..effects.robot import Robot
+from ..effects.units import unit_at
 from .objective import Unit
 from .refit import Fit
-from .report import Candidate
+from .report import Candidate, Verdict
 from .selection import Selection
+from .validation import SHOWN
 
 _UNTESTED = 0.2  # of an effect's range that does nothing in these data
 
 
 def candidates(
-    selection: Selection, confused: Sequence[str], alpha: float
+    selection: Selection, confused: Sequence[str], robot: Robot, alpha: float
 ) -> tuple[Candidate, ...]:
     """Return what the data say about every unit."""
     seen = selection.screens[0]
@@ -38,11 +42,13 @@ def candidates(
         if forms[str(unit)] is not unit:
             continue
         model, ci, gain = fitted.get(unit), None, None
+        at = selection.best if unit in used else model  # beside the others, as it is named
         strength = unit.actual(strength)  # noqa: PLW2901
-        if model is not None:
-            strength = unit.actual(model.fit.point.strengths[unit])  # noqa: PLW2901 - knows better
-            error = strength_errors(model.fit, model.dispersion(), len(model.fit.point.z))[unit]
+        if at is not None:
+            strength = unit.actual(at.fit.point.strengths[unit])  # noqa: PLW2901 - knows better
+            error = strength_errors(at.fit, at.dispersion(), len(at.fit.point.z))[unit]
             ci = (strength - 1.96 * error, strength + 1.96 * error)
+        if model is not None:
             before = float((selection.nominal.validation**2).sum())
             gain = before - float((model.validation**2).sum())
             # a bent fit hides from its derivatives what a fit of the effect then shows
@@ -61,6 +67,7 @@ def candidates(
                 explained_by_parameters=swallowed[unit],
                 minimal_detectable_strength=unit.actual(least) if np.isfinite(least) else None,
                 form=unit.effect.form,
+                unit=unit_at(unit.effect, robot, int(np.argmax(unit.direction))),
                 status=_status(
                     unit,
                     used,
@@ -72,6 +79,36 @@ def candidates(
             )
         )
     return tuple(sorted(result, key=lambda c: -c.likelihood_ratio))
+
+
+def concluded(
+    seen: Sequence[Candidate], verdict: Verdict, named: Collection[str], *, left: float
+) -> tuple[Candidate, ...]:
+    """Return candidates as a verdict leaves them.
+
+    Only what it names is named. Where it leaves more than noise nothing is ruled out: what else is
+    missing may be just what hides an effect. Where there is no gap nothing explains it.
+
+    Args:
+        seen: What the data say of each alone.
+        verdict: The verdict.
+        named: Names of its effects.
+        left: Mean squared innovation with these.
+    """
+    hides = verdict != "none" and left > SHOWN
+    result = []
+    for one in seen:
+        changes: dict[str, Any] = {}
+        if one.status == "named" and one.name not in named:
+            changes["status"] = "rejected"
+        if hides and one.status != "named":
+            changes["minimal_detectable_strength"] = None
+            if one.status == "ruled_out":
+                changes["status"] = "rejected"
+        if verdict in {"none", "not_testable"}:
+            changes["explained_fraction"] = 0.0
+        result.append(replace(one, **changes))
+    return tuple(result)
 
 
 def _status(

@@ -12,7 +12,7 @@ from ..effects.transmission import ServoDeadBand
 from .alternatives import kind
 from .model import Model, as_good
 from .objective import Objective
-from .selection import Selection, parts
+from .selection import Selection, parts, without_idle
 
 _SAME = 2.0  # of a deviance: what fits of one and the same law may differ by
 _LAST = 0.01  # of what an effect explains: too little to prefer one law to another
@@ -153,7 +153,8 @@ def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> S
     first = min(same, key=lambda model: (_sensing(model), deviances[model]))
     if first is selection.best:
         return selection
-    others = tuple(m for m in (selection.best, *selection.alternatives[name]) if m is not first)
+    chosen, first = first, without_idle(sets["train"], sets["validation"], first)
+    others = tuple(m for m in (selection.best, *selection.alternatives[name]) if m is not chosen)
     kept = {n: models for n, models in selection.alternatives.items() if n != name}
     tried = (*selection.tried, *parts(sets["train"], sets["validation"], first))
     return replace(

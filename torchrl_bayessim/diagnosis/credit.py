@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["apart", "credit_of", "shares", "unit_credit"]
+__all__ = ["apart", "credit_of", "shares", "unit_credit", "worthwhile"]
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -13,6 +13,27 @@ import numpy as np
 
 from .objective import Objective, Unit
 from .selection import Selection, parts
+
+_LEAST = 0.005  # of the credit, to be named beside another cause
+
+
+def worthwhile(selection: Selection, sets: Mapping[str, Objective]) -> Selection:
+    """Return the selection, apart, without effects that have next to no credit.
+
+    In a model that is a little off everywhere a further effect mends some of it, surely but for
+    nothing.
+    """
+    while True:
+        selection = apart(selection, sets)
+        credit = credit_of(selection)
+        least = min(credit, key=credit.__getitem__, default="")
+        if len(credit) < 2 or credit[least] >= _LEAST:
+            return selection
+        kept = {unit for unit in selection.best.units if unit.name != least}
+        without = [model for model in selection.tried if set(model.units) == kept]
+        best = min(without, key=lambda model: float(model.deviances().sum()))
+        others = {n: models for n, models in selection.alternatives.items() if n != least}
+        selection = replace(selection, best=best, alternatives=others)
 
 
 def apart(selection: Selection, sets: Mapping[str, Objective]) -> Selection:

@@ -42,7 +42,7 @@ _RUNS = 3  # more are no proposal: what a model leaves out would decide, not the
 _DECIDED = 34.3  # 4 (1.645 + 1.282)²
 _LEVEL = 0.4  # of its range: an effect that could not be tested
 _MOST = 3  # proposals
-_SURE = 1e6  # odds beyond which figures say nothing
+_SURE = 1e3  # odds beyond which what no model has decides
 _DELAYS = {"action_delay", "sensor_delay"}
 
 

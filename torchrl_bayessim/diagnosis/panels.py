@@ -160,7 +160,7 @@ def _row(c: Candidate, unit: str) -> list[object]:
         plain(c.name),
         c.where,
         element("span", _STATUS[c.status], class_=f"status {c.status}"),
-        strength(c.strength, c.ci95, unit),
+        "–" if c.ci95 is None else strength(c.strength, c.ci95, unit),
         chance(c.p_value),
         number(c.held_out_gain),
         bar(c.explained_fraction),

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 __all__ = ["Regime", "features", "regimes"]
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ from ..effects.robot import Robot
 from .segments import Segments
 
 Array = NDArray[np.float64]
+_Cut = tuple[str, str, float]  # feature, side and threshold
 _CUTS = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
 _DEPTH = 2
 _LEAST = 12  # rows in a leaf
@@ -76,17 +77,29 @@ def regimes(
         support = float(rows.mean())
         share = float(np.maximum(counted[1], 0.0)[rows].sum() / total)
         if 0.0 < support < 1.0 and share > 1.3 * support:
-            found.append(Regime(" & ".join(rule), support, share))
+            found.append(Regime(_worded(rule), support, share))
     return sorted(found, key=lambda regime: -regime.share)
+
+
+def _worded(cuts: Sequence[_Cut]) -> str:
+    """Return cuts in words; of several on one side of a feature the last holds, which is nearest.
+
+    >>> _worded([("time", "<", 1.68), ("|v|", ">=", 0.2), ("time", "<", 1.36)])
+    'time < 1.36 & |v| >= 0.2'
+    """
+    last = {(name, sign): cut for name, sign, cut in cuts}
+    return " & ".join(f"{name} {sign} {cut:.3g}" for (name, sign), cut in last.items())
 
 
 def _leaves(
     grown: tuple[Array, Array], counted: Array, names: list[str]
-) -> list[tuple[list[str], NDArray[np.bool_]]]:
+) -> list[tuple[list[_Cut], NDArray[np.bool_]]]:
     """Return the leaves' rules and which of the counted rows they cover."""
     values, target = grown
-    todo = [([], np.ones(values.shape[1], bool), np.ones(counted.shape[1], bool), 0)]
-    leaves: list[tuple[list[str], NDArray[np.bool_]]] = []
+    todo: list[tuple[list[_Cut], NDArray[np.bool_], NDArray[np.bool_], int]] = [
+        ([], np.ones(values.shape[1], bool), np.ones(counted.shape[1], bool), 0)
+    ]
+    leaves: list[tuple[list[_Cut], NDArray[np.bool_]]] = []
     while todo:
         rule, here, there, depth = todo.pop()
         best = _best_cut(values[:, here], target[here]) if depth < _DEPTH else None
@@ -98,8 +111,9 @@ def _leaves(
         for below, sign in ((True, "<"), (False, ">=")):
             side = (values[feature] < cut) == below
             other = (counted[feature] < cut) == below
-            text = f"{names[feature]} {sign} {cut:.3g}"
-            todo.append(([*rule, text], here & side, there & other, depth + 1))
+            todo.append(
+                ([*rule, (names[feature], sign, cut)], here & side, there & other, depth + 1)
+            )
     return leaves
 
 

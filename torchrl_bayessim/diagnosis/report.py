@@ -76,6 +76,7 @@ class Candidate:
             where not even the largest plausible strength.
         status: What became of it.
         form: What its law has beside the strength, as in :class:`Finding`.
+        unit: Of the strength.
     """
 
     name: str
@@ -90,6 +91,7 @@ class Candidate:
     minimal_detectable_strength: float | None
     status: Literal["named", "rejected", "ruled_out", "not_excited", "confounded"]
     form: Mapping[str, float] = field(default_factory=dict)
+    unit: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["rollout_errors"]
+__all__ = ["rollout_errors", "worse_rollouts"]
 
 from collections.abc import Mapping
 
@@ -11,6 +11,8 @@ import numpy as np
 from .objective import Point, strengths_of
 from .preparation import Prepared
 from .segments import cut
+
+_WORSE = 1.5
 
 
 def rollout_errors(prepared: Prepared, points: Mapping[str, Point]) -> dict[str, dict[str, float]]:
@@ -38,3 +40,22 @@ def rollout_errors(prepared: Prepared, points: Mapping[str, Point]) -> dict[str,
         error = np.nan_to_num(error, nan=np.inf)
         result[name] = dict(zip(predictor.system.robot.channels, error.tolist(), strict=False))
     return result
+
+
+def worse_rollouts(errors: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Return an alarm for channels that whole runs with the effects predict worse than without.
+
+    What explains short segments and not the runs is not all of the cause, or not the cause.
+
+    Example:
+        >>> worse_rollouts({"refit": {"hinge": 0.8}, "with_effects": {"hinge": 3.8}})
+        ['whole runs are predicted worse with the effects than without: hinge 3.8 against 0.8']
+    """
+    before, after = errors["refit"], errors["with_effects"]
+    found = [
+        f"{name} {after[name]:.3g} against {before[name]:.3g}"
+        for name in before
+        if np.isfinite(before[name]) and after[name] > _WORSE * before[name]
+    ]
+    text = "whole runs are predicted worse with the effects than without: "
+    return [text + ", ".join(found)] if found else []

@@ -176,9 +176,15 @@ class Scatter:
             for effect, values in on.items()
         }
 
-    def candidates(self) -> list[Candidate]:
+    def candidates(self, robot: Robot) -> list[Candidate]:
         """Return what the data say of each that was looked for."""
-        return [self._candidate(unit, least) for unit, least in self.least.items()]
+        return [
+            replace(
+                self._candidate(unit, least),
+                unit=unit_at(unit.effect, robot, int(np.argmax(unit.direction))),
+            )
+            for unit, least in self.least.items()
+        ]
 
     def _candidate(self, unit: Unit, least: float) -> Candidate:
         strength, error, gain = self._known(unit)

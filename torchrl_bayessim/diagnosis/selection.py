@@ -9,7 +9,7 @@ best few; afterwards every unit has to show that the model needs it.
 
 from __future__ import annotations
 
-__all__ = ["Selection", "parts", "select"]
+__all__ = ["Selection", "parts", "select", "without_idle"]
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -31,6 +31,7 @@ _SURELY, _NOTHING = 50.0, 0.2  # gain, and share of what the base leaves: it was
 _MOST = 4  # effects in one explanation
 _UNSEEN = 1.0  # a deviance that no test can detect
 _EXCHANGES = 3  # of effects for others in their places
+_IDLE = 1e-3  # of the deviance that an effect explains at another place
 _APART = 3  # effects without each of which a model is fitted with derivatives of its own
 
 
@@ -192,7 +193,7 @@ def _coarser(model: Model, models: Sequence[Model]) -> list[Model]:
         for m in models
         if {u.effect.group for u in m.units} == kinds
         and len(m.units) < len(model.units)
-        and gain(m, model) <= needed(m, model)
+        and (gain(m, model) <= needed(m, model) or as_good(model, m))
     ]
 
 
@@ -238,17 +239,16 @@ def _identified(start: Model, base: Model, better: Model, models: Sequence[Model
         if m is not better and as_good(better, m)
     ]
     just_this = gain(base, better) > _SURELY and after - 1.0 < _NOTHING * (before - 1.0)
-    return (before > _WRONG or just_this) and all(groups <= added for groups in rivals)
+    # what has the same beside something else says nothing against it
+    alike = all(groups <= added or added <= groups for groups in rivals)
+    return (before > _WRONG or just_this) and alike
 
 
 def _eliminated(train: Objective, validation: Objective, model: Model) -> tuple[Model, list[Model]]:
     """Take out, one at a time, units without which the data are explained as well."""
     tried: list[Model] = []
     while model.units:
-        without = [model.fit.without(unit) for unit in model.units]
-        few = len(without) <= _APART
-        fits = refit(train, [fit.point for fit in without], origins=without, renew=few)
-        smaller = judged(train, validation, fits)
+        smaller = _without_each(train, validation, model)
         tried += smaller
         criteria = [criterion(m, model.dispersion()) for m in smaller]
         best = int(np.argmin(criteria))
@@ -256,10 +256,49 @@ def _eliminated(train: Objective, validation: Objective, model: Model) -> tuple[
         if criteria[best] > criterion(model, model.dispersion()) and loss > needed(
             smaller[best], model
         ):
-            break
+            idle = _idle_place(model, smaller)
+            if idle is None:
+                break
+            best = idle
         model = smaller[best]
     there = refit(train, [model.fit.point], iterations=0)[0]
     return replace(model, fit=there), tried
+
+
+def _without_each(train: Objective, validation: Objective, model: Model) -> list[Model]:
+    """Return the model without each of its units, fitted."""
+    without = [model.fit.without(unit) for unit in model.units]
+    few = len(without) <= _APART
+    fits = refit(train, [fit.point for fit in without], origins=without, renew=few)
+    return judged(train, validation, fits)
+
+
+def without_idle(train: Objective, validation: Objective, model: Model) -> Model:
+    """Return a model without the places of an effect that next to nothing is due to."""
+    while len({unit.name for unit in model.units}) < len(model.units):
+        smaller = _without_each(train, validation, model)
+        idle = _idle_place(model, smaller)
+        if idle is None:
+            break
+        model = smaller[idle]
+    return model
+
+
+def _idle_place(model: Model, smaller: Sequence[Model]) -> int | None:
+    """Return the unit of an effect at several places which next to nothing is due to, if any.
+
+    Where a model is a little off everywhere, any strength mends some of it, surely and for nothing.
+
+    Args:
+        model: With all units.
+        smaller: Without each of them.
+    """
+    names = [unit.name for unit in model.units]
+    total = model.deviances().sum()
+    lost = [float(m.deviances().sum() - total) for m in smaller]
+    least = int(np.argmin(lost))
+    alike = [loss for loss, name in zip(lost, names, strict=True) if name == names[least]]
+    return least if len(alike) > 1 and lost[least] < _IDLE * max(alike) else None
 
 
 def parts(train: Objective, validation: Objective, model: Model) -> list[Model]:

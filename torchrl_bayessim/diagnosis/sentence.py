@@ -89,7 +89,10 @@ def _retuned(measured: Shrinkage, *, fitted: bool, found: bool) -> str:
     """
     if fitted and measured.raw > measured.refit:
         share = (measured.raw - measured.refit) / max(measured.raw - 1.0, 1e-9)
-        return f" Retuning parameters alone explains {_percent(min(share, 1.0))}."
+        return (
+            f" Retuning parameters alone removes {_percent(min(share, 1.0))} of the gap as "
+            f"described ({measured.raw:.3g} times the floor)."
+        )
     if not measured.misled:
         return ""
     together = f", {_percent(measured.of_raw)} of which parameters and effects explain together"
@@ -154,6 +157,9 @@ def _described(effect: Finding) -> str:
     law = "".join(text.format(effect.form[k]) for k, text in _FORMS.items() if k in effect.form)
     if len(effect.strengths) > 1:
         least, most = (pick(effect.strengths.values()) for pick in (min, max))
+        if most - least <= 1e-3 * abs(most):
+            each = f"{effect.strength:.3g} ± {half:.2g} {effect.unit}{law}"
+            return f"{name} at {len(effect.strengths)} places ({each} each)"
         sizes = f"{least:.3g} to {most:.3g} {effect.unit}, mean {effect.strength:.3g} ± {half:.2g}"
         return f"{name} at {len(effect.strengths)} places ({sizes}{law})"
     place = "at all" if effect.where == "all" else f"at {effect.where}"
@@ -166,14 +172,14 @@ def _ruled_out(candidates: Sequence[Candidate]) -> str:
     for c in candidates:
         if c.status == "ruled_out" and c.minimal_detectable_strength is not None:
             name, least = c.name.replace("_", " "), c.minimal_detectable_strength
-            text = f"{name} above {least:.2g} {_unit(c)}"
+            text = f"{name} above {least:.2g} {c.unit} {_place(c)}"
             found.setdefault(c.name, text)
     some = list(found.values())[:4]
     more = f" and {len(found) - 4} more" if len(found) > 4 else ""
     return f" Ruled out: {', '.join(some)}{more}." if some else ""
 
 
-def _unit(candidate: Candidate) -> str:
+def _place(candidate: Candidate) -> str:
     return f"at {candidate.where}" if candidate.where != "all" else "anywhere"
 
 

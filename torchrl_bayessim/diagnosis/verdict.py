@@ -5,7 +5,7 @@ how much of it the effects explain, not only whether it is significant::
 
     none           nothing significant, or an excess below 5 % of the noise floor
     named          effects explain at least 80 %, surely 40 %, and what is left is not significant,
-                   or 2 % and no more than the noise
+                   or 2 % and no more than the noise, of several effects a fifth of it
     named_partial  effects explain at least 40 %; the rest is located. Or 80 % on validation runs,
                    where test runs hardly show the gap
     ambiguous      effects of different kinds explain the data equally well
@@ -131,6 +131,7 @@ class _Weighed:
         validated: Share of the gap that is explained on validation runs.
         unsaid: Whether test runs do not say that what was found explains it.
         elsewhere: Whether validation runs do in their place.
+        several: Whether several effects were found.
     """
 
     measured: Shrinkage
@@ -140,6 +141,7 @@ class _Weighed:
     validated: float
     unsaid: bool
     elsewhere: bool
+    several: bool
 
     @classmethod
     def of(
@@ -171,7 +173,9 @@ class _Weighed:
         borne_out = certain or measured.effects < measured.refit or validated >= PARTIAL
         found = p_value <= alpha and borne_out and bool(selection.best.units)
         significant = found or by_chance
-        return cls(measured, significant, certain, visible, validated, unsaid, elsewhere)
+        return cls(
+            measured, significant, certain, visible, validated, unsaid, elsewhere, len(effects) > 1
+        )
 
     def named(self, *, ambiguous: bool) -> Verdict:
         """Return the verdict on effects that were found."""
@@ -184,8 +188,10 @@ class _Weighed:
             return "named_partial" if self.elsewhere else "unknown" if sure else "none"
         if ambiguous:
             return "ambiguous"
-        # of a large gap, 2 % may be ten times the noise: proof that the law is another one
-        nearly_all = measured.explained >= _ALL and measured.effects <= _NOISE_AGAIN
+        # of a large gap, 2 % may be ten times the noise: proof that the law is another one; two
+        # laws together imitate many a third one nearly
+        most = SHOWN if self.several else _NOISE_AGAIN
+        nearly_all = measured.explained >= _ALL and measured.effects <= most
         left = 1.0 + measured.remainder_ci[0] > NEGLIGIBLE and not nearly_all
         borne_out = measured.explained >= NAMED and measured.explained_ci[0] >= PARTIAL
         # a share of an error that fitting made larger flatters the effects

@@ -1,0 +1,75 @@
+"""Places of an effect, and effects, that a model has for nothing."""
+
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from torchrl_bayessim.diagnosis.alternatives import exchanged
+from torchrl_bayessim.diagnosis.credit import worthwhile
+from torchrl_bayessim.diagnosis.model import Model
+from torchrl_bayessim.diagnosis.selection import Selection, _identified, _idle_place
+
+
+class Unit(NamedTuple):
+    name: str
+    where: str
+
+    @property
+    def effect(self):
+        return SimpleNamespace(group=self.name)
+
+
+A, B, C = Unit("gain", "knee"), Unit("gain", "hip"), Unit("friction", "hip")
+
+
+def model(units, deviance, *, segments=40):
+    """Return a model whose segments all leave as much."""
+    left = np.full((segments // 2, 10), np.sqrt(deviance / (10 * segments)))
+    fit = SimpleNamespace(units=tuple(units), innovations=left)
+    return Model(fit=fit, validation=left, logs=np.arange(segments))
+
+
+@pytest.mark.parametrize(
+    ("without", "idle"),
+    [((9000.0, 505.0), 1), ((9000.0, 700.0), None), ((504.0, 505.0), None)],
+)
+def test_a_place_that_next_to_nothing_is_due_to_is_idle(without, idle):
+    smaller = [model([B], without[0]), model([A], without[1])]
+    assert _idle_place(model([A, B], 500.0), smaller) == idle
+
+
+def test_an_effect_of_its_own_is_not_idle():
+    smaller = [model([C], 9e6), model([A], 510.0)]
+    assert _idle_place(model([A, C], 500.0), smaller) is None
+
+
+@pytest.mark.parametrize(("without", "kept"), [(510.0, {"gain"}), (2500.0, {"gain", "friction"})])
+def test_an_effect_with_next_to_no_credit_is_not_named(without, kept):
+    start, best = model([], 10_000.0), model([A, C], 500.0)
+    others = {"friction": (model([A, Unit("drag", "hip")], 600.0),)}
+    tried = (start, model([A], without), model([C], 10_000.0))
+    selection = Selection(start, best, (), (0.0,), tried, others)
+    left = worthwhile(selection, {})
+    assert {one.name for one in left.best.units} == kept
+    assert set(left.alternatives) == kept & set(others)
+
+
+@pytest.mark.parametrize(("share", "changed"), [(0.97, False), (0.5, True)])
+def test_more_strengths_do_not_take_the_place_of_fewer_that_are_as_good(share, changed):
+    rng = np.random.default_rng(0)
+    best, more = model([A], 5000.0), model([Unit("delay", "x"), Unit("delay", "y")], 5000.0)
+    each = rng.uniform(0.5, 1.5, len(best.validation))[:, None]  # better here, worse there
+    fit = SimpleNamespace(units=more.units, innovations=np.sqrt(share) * each * more.validation)
+    other = Model(fit=fit, validation=fit.innovations, logs=more.logs)
+    assert (exchanged(best, {"gain": (other,)}) is other) == changed
+
+
+@pytest.mark.parametrize(
+    ("rival", "added"), [([A, C, Unit("delay", "x")], True), ([A, Unit("delay", "x")], False)]
+)
+def test_what_has_the_same_beside_something_else_says_nothing_against_an_effect(rival, added):
+    """A fiftieth of the gap, of which the new effect leaves nothing; a rival is as good."""
+    start, base, better = model([], 1e6), model([A], 20_000.0), model([A, C], 450.0)
+    assert _identified(start, base, better, [better, model(rival, 448.0)]) == added
