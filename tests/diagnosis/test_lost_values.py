@@ -4,6 +4,7 @@ import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -14,6 +15,9 @@ from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.loss_law import LossLaw, Tried, likeliest
 from torchrl_bayessim.diagnosis.losses import _explained
 from torchrl_bayessim.diagnosis.model import Model
+from torchrl_bayessim.envs.task import Task
+from torchrl_bayessim.logs.log import Log
+from torchrl_bayessim.logs.system import System
 
 SOME = ("action_delay", "action_jitter", "packet_drop", "sensor_dropout", "coulomb_friction")
 
@@ -174,3 +178,44 @@ def test_the_likeliest_law_of_a_grid_is_the_one_of_least_deviance_by_the_definit
     for law in laws:
         assert law.deviance(parts) == pytest.approx(deviance(law), rel=1e-12)
     assert likeliest(parts, shares, scatters, spoiled, size=12) == min(laws, key=deviance)
+
+
+TWO = """
+<mujoco><option timestep="0.01" integrator="implicitfast"/><worldbody><body>
+  <joint name="first" axis="0 1 0" damping=".1" armature=".02"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass=".6"/><body pos="0 0 -.4">
+  <joint name="second" axis="0 1 0" damping=".1" armature=".02"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".3"/></body></body></worldbody>
+<actuator><motor name="one" joint="first"/><motor name="two" joint="second"/></actuator></mujoco>
+"""
+
+
+def run_of_two(rng, name, *, share, steps=150):
+    """Return a run whose packets, each with both commands, are lost now and then."""
+    model = mujoco.MjModel.from_xml_string(TWO)
+    data, sent, last, rows = mujoco.MjData(model), rng.normal(size=(steps, 2)), np.zeros(2), []
+    for command in sent:
+        rows.append(np.r_[data.qpos, data.qvel])
+        last = command if rng.random() >= share else last
+        data.ctrl[:] = last
+        mujoco.mj_step(model, data)
+    noise = rng.normal(size=(steps, 4)) * [1e-3, 1e-3, 1e-2, 1e-2]
+    state = torch.from_numpy(np.array(rows) + noise)
+    return Log(
+        name=name,
+        time=0.01 * torch.arange(steps).double(),
+        qpos=state[:, :2],
+        qvel=state[:, 2:],
+        ctrl=torch.from_numpy(sent),
+        velocity_gain=torch.zeros(2).double(),
+        measured=torch.ones(4, dtype=torch.bool),
+    )
+
+
+def test_packets_that_hold_the_commands_of_all_actuators_are_lost_as_one():
+    rng = np.random.default_rng(8)
+    data = [run_of_two(rng, f"run{i}", share=0.1) for i in range(6)]
+    robot = System(task=Task(model=mujoco.MjModel.from_xml_string(TWO), frame_skip=1))
+    (found,) = diagnose(robot, None, data, effects=("packet_drop", "action_lag")).effects
+    assert (found.name, found.where) == ("packet_drop", "all")
+    assert found.ci95[0] < 0.1 < found.ci95[1]

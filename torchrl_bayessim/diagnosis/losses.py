@@ -88,12 +88,19 @@ class _Data:
 
     def tried(self, unit: Unit) -> Tried:
         """Return the segments under every pattern of losses."""
-        target, steps = int(np.argmax(unit.direction)), self.objective.segments.horizon
+        targets, steps = np.flatnonzero(unit.direction), self.objective.segments.horizon
         commands = isinstance(unit.effect, PacketDrop)
         patterns = _patterns(steps if commands else 1 + steps)
         of = self._of_commands if commands else self._of_samples
-        squares = _squares(self.left, *of(target, patterns))
+        parts = [of(int(target), patterns) for target in targets]  # lost together
+        columns, changes = (np.concatenate(part, -1) for part in zip(*parts, strict=True))
+        squares = _squares(self.left, columns, changes)
         return Tried(squares, np.array([sum(p) for p in patterns]), len(patterns[0]))
+
+    @cached_property
+    def _known(self) -> dict[int, Array]:
+        """Slopes by actuator."""
+        return {}
 
     @cached_property
     def _simulated(self) -> Array:
@@ -106,18 +113,27 @@ class _Data:
 
     def _of_commands(self, actuator: int, patterns: Patterns) -> tuple[Array, Array]:
         """Return what a change of each command does, ``(S, M, T)``, and changes, ``(B, S, T)``."""
-        segments, robot = self.objective.segments, self.objective.predictor.system.robot
+        segments = self.objective.segments
         at, steps = segments.history, segments.horizon
         sent = segments.ctrl[:, at - 1 : at + steps, actuator]
+        changes = [sent[:, _last(lost)] - sent[:, 1:] for lost in patterns]
+        return self._slopes(actuator, sent), np.stack(changes)
+
+    def _slopes(self, actuator: int, sent: Array) -> Array:
+        """Return what a change of each command of an actuator does, ``(S, M, T)``."""
+        if actuator in self._known:
+            return self._known[actuator]
+        segments, robot = self.objective.segments, self.objective.predictor.system.robot
+        at = segments.history
         nudge = -_NUDGE * float(robot.command_scale[actuator]) * np.where(sent > 0, 1.0, -1.0)
         slopes = []
-        for t in range(steps):
+        for t in range(segments.horizon):
             ctrl = segments.ctrl.copy()
             ctrl[:, at + t, actuator] += nudge[:, 1 + t]
             moved = self.objective.along(replace(segments, ctrl=ctrl))([self.point])[0]
             slopes.append((moved - self.left) / nudge[:, 1 + t, None])
-        changes = [sent[:, _last(lost)] - sent[:, 1:] for lost in patterns]
-        return np.stack(slopes, -1), np.stack(changes)
+        self._known[actuator] = np.stack(slopes, -1)
+        return self._known[actuator]
 
     def _of_samples(self, channel: int, patterns: Patterns) -> tuple[Array, Array]:
         """Return the same of samples, the start's first."""
@@ -169,7 +185,8 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
     Args:
         prepared: Logs, noise and nominal fit.
         selection: What the search without chance found.
-        units: Random effects at their targets; of those lost commands and samples of one target.
+        units: Random effects at their targets; of those lost commands, of one actuator or of all
+            at once, and samples of one target.
     """
     some = [u for u in units if isinstance(u.effect, PacketDrop | SensorDropout) and _single(u)]
     if not some or type(prepared.mode) is not Mode:
@@ -235,7 +252,9 @@ def _spoiled(told: Told) -> float:
 
 
 def _single(unit: Unit) -> bool:
-    return unit.where != "all" or len(unit.direction) == 1
+    """Return whether a unit is lost as one: a packet holds all commands, but no reading of all."""
+    alone = unit.where != "all" or len(unit.direction) == 1
+    return alone or isinstance(unit.effect, PacketDrop)
 
 
 def _squares(left: Array, columns: Array, changes: Array) -> Array:
