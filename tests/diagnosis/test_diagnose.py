@@ -124,13 +124,27 @@ def test_a_gap_that_nothing_explains_is_not_called_none():
 
 
 def test_a_smaller_cause_is_named_beside_a_larger_one():
-    """A fortieth of what the constant force explains, and several times the noise."""
-    data = logs(push=lambda q, v: 0.3 - 0.1 * np.tanh(v / 0.01))
-    effects = "constant_force", "coulomb_friction", "sensor_drift", "action_gain"
+    """A hundredth of what the spring explains, and 25 times the noise."""
+    data = logs(push=lambda q, v: -0.2 * np.tanh(v / 0.01) - 1.5 * q)
+    effects = "parallel_spring", "coulomb_friction", "constant_force", "action_bias"
     report = diagnose(system(), None, data, effects=effects)
     found = {effect.name: effect.strength for effect in report.effects}
-    assert found["constant_force"] == pytest.approx(0.3, rel=0.1)
-    assert found["coulomb_friction"] == pytest.approx(0.1, rel=0.2)
+    assert found["parallel_spring"] == pytest.approx(1.5, rel=0.1)
+    assert found["coulomb_friction"] == pytest.approx(0.2, rel=0.2)
+
+
+def test_a_further_cause_has_rivals_of_its_own():
+    data = logs(push=lambda q, v: 0.3 - 0.2 * np.tanh(v / 0.01))
+    effects = (
+        "coulomb_friction", "constant_force", "action_bias", "sensor_bias", "parallel_spring",
+        "load_dependent_friction", "directional_friction",
+    )  # fmt: skip
+    report = diagnose(system(), None, data, effects=effects)
+    first, second = report.effects
+    assert (first.name, second.name) == ("action_bias", "coulomb_friction")
+    assert report.confusion_set == (first.name, *first.rivals)
+    assert "directional_friction" in second.rivals
+    assert f"place of coulomb friction it may be: {', '.join(second.rivals)}." in str(report)
 
 
 def test_nothing_is_ruled_out_while_something_is_missing():

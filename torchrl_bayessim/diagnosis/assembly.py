@@ -325,6 +325,7 @@ def _effects(
                 share_of_gap=max(0.0, credit.get(name, 0.0) * measured.explained),
                 strengths={u.where: s for u, s in zip(units, strengths, strict=True)},
                 form=units[int(np.argmax(np.abs(strengths)))].effect.form,
+                rivals=tuple(confusion_set(selection, name)[1:]),
             )
         )
     return tuple(sorted(found, key=lambda f: -f.share_of_gap))

@@ -15,6 +15,7 @@ from .objective import Objective, Unit
 from .selection import Selection, parts
 
 _LEAST = 0.005  # of the credit, to be named beside another cause
+_MORE = 1.5  # times what is left with it, without
 
 
 def worthwhile(selection: Selection, sets: Mapping[str, Objective]) -> Selection:
@@ -32,6 +33,8 @@ def worthwhile(selection: Selection, sets: Mapping[str, Objective]) -> Selection
         kept = {unit for unit in selection.best.units if unit.name != least}
         without = [model for model in selection.tried if set(model.units) == kept]
         best = min(without, key=lambda model: float(model.deviances().sum()))
+        if best.deviances().sum() > _MORE * selection.best.deviances().sum():
+            return selection  # little of the gap, but most of what is left of it
         others = {n: models for n, models in selection.alternatives.items() if n != least}
         selection = replace(selection, best=best, alternatives=others)
 

@@ -175,9 +175,10 @@ def _told(effect: Finding, units: Mapping[str, str]) -> str:
     several = f" ({by_target})" if len(effect.strengths) > 1 else ""
     unit = units.get(f"{effect.name}[{effect.where}]", effect.unit)
     amount = strength(effect.strength, effect.ci95, unit)
+    rivals = f" Or {', '.join(plain(name) for name in effect.rivals)}." if effect.rivals else ""
     return (
         f"Found: {words(effect.name, effect.where)}, {amount}{several}; "
-        f"p-value {chance(effect.p_value)}; {percent(effect.share_of_gap)} of the gap."
+        f"p-value {chance(effect.p_value)}; {percent(effect.share_of_gap)} of the gap.{rivals}"
     )
 
 

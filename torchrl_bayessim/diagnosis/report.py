@@ -45,6 +45,7 @@ class Finding:
         strengths: By target.
         form: What its law has beside the strength, by the names of the effect's options, such as
             the ``frequency`` of a ``periodic_disturbance`` in Hz; of the strongest target's.
+        rivals: Names that these data cannot tell from it, beside what else was found.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Finding:
     share_of_gap: float
     strengths: Mapping[str, float]
     form: Mapping[str, float] = field(default_factory=dict)
+    rivals: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -65,18 +65,28 @@ def sentence(
         share = f"explains {_percent(validated)} of it on validation runs, test runs hardly show it"
     elif measured.refit <= NEGLIGIBLE:
         share = "found on other runs, too small to matter on test runs"
+    others = _rivals_of_others(effects, confused)
     if verdict == "ambiguous":
-        others = ", ".join(confused)
+        equals = ", ".join(confused)
         return (
-            f"{gap} These data cannot tell the causes apart: {others}. The first, {causes}, "
-            f"{share}.{parameters}{untested}"
+            f"{gap} These data cannot tell the causes apart: {equals}. The first, {causes}, "
+            f"{share}.{others}{parameters}{untested}"
         )
     text = f"{gap} Cause: {causes}, {share}"
     partial = verdict != "named" and validated is None and measured.refit > NEGLIGIBLE
     text += f"; {_percent(1 - measured.explained)} remain." if partial else "."
     if len(confused) > 1:
         text += f" Not separable from: {', '.join(confused[1:])}."
-    return f"{text}{parameters}{untested}"
+    return f"{text}{others}{parameters}{untested}"
+
+
+def _rivals_of_others(effects: Sequence[Finding], confused: Sequence[str]) -> str:
+    """Return what may stand in the place of effects beside the first."""
+    return "".join(
+        f" In the place of {e.name.replace('_', ' ')} it may be: {', '.join(e.rivals)}."
+        for e in effects
+        if e.rivals and e.name not in confused[:1]
+    )
 
 
 def _retuned(measured: Shrinkage, *, fitted: bool, found: bool) -> str:
