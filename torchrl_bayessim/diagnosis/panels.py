@@ -144,7 +144,7 @@ def evidence(report: Report) -> Markup:
     order = list(_STATUS)
     some = sorted(report.candidates, key=lambda c: (order.index(c.status), -c.likelihood_ratio))
     rows = [_row(c, units.get(f"{c.name}[{c.where}]", "")) for c in some]
-    head = ["effect", "where", "status", "strength alone", "p", "held-out gain",
+    head = ["effect", "where", "status", "strength", "p alone", "held-out gain",
             "explains alone", "swallowed by parameters", "would have been seen from"]  # fmt: skip
     told = [element("p", _told(effect, units)) for effect in report.effects]
     if len(report.confusion_set) > 1:

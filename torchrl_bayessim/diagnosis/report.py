@@ -67,7 +67,7 @@ class Candidate:
     Attributes:
         name: Its name.
         where: Its target.
-        strength: The most likely one, alone.
+        strength: The most likely one, alone; of what is named, beside the others.
         ci95: Its interval where it was fitted, else ``None``.
         likelihood_ratio: Of the screen at the nominal fit.
         p_value: Of that ratio among all that were tried.
