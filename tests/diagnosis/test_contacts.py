@@ -108,6 +108,8 @@ def test_a_mass_and_an_armature_are_not_taken_for_friction_of_the_contact():
     report = diagnose(system(), None, logs, effects=effects)
     assert report.effects[0].name == "contact_friction"
     assert report.effects[0].strength == pytest.approx(-0.3, abs=0.1)
+    assert report.where["channel"]["contact"] > 0.5
+    assert sum(joint["share"] for joint in report.where["joints"]) == pytest.approx(1.0)
 
 
 def test_what_rests_is_told_from_what_slides_and_from_what_flies():

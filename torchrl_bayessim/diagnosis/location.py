@@ -64,6 +64,10 @@ def location(
                  and (j := unit.effect.joint(robot, i)) >= 0]  # fmt: skip
         for joint in moved:
             joints[robot.joints[joint]] += gain / len(moved)
+    if not any(joints.values()):  # of what acts at no joint, where it shows
+        for joint, share in zip(robot.channel_joint, by_output, strict=True):
+            if joint >= 0:
+                joints[robot.joints[joint]] += float(share)
     return {
         "channel": _shares(channels),
         "outputs": _named(dict(zip(robot.channels, by_output.tolist(), strict=True))),
