@@ -60,7 +60,7 @@ def test_a_cause_that_may_be_nothing_at_the_end_of_its_range_is_none(monkeypatch
     if at_the_end:
         monkeypatch.setattr(f"{where}.doubts._EDGE", 0.01)
     monkeypatch.setattr(
-        f"{where}.assembly.strength_errors",
+        f"{where}.found.strength_errors",
         lambda fit, *_: dict.fromkeys(fit.units, 1.0),  # N m, of 0.15
     )
     report = diagnose(system(), None, logs(push=friction), effects=["coulomb_friction"])

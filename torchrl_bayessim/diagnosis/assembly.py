@@ -6,39 +6,36 @@ __all__ = ["assemble"]
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects.effect import Effect
-from ..effects.robot import Robot
-from ..effects.sensors import SensorDropout
-from ..effects.units import unit_at
 from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
-from .candidates import candidates, concluded, strength_errors
-from .confusion import confusion_set, settled
+from .candidates import candidates, concluded
+from .confusion import settled
 from .credit import credit_of, unit_credit, worthwhile
 from .divergence import divergence_alarms, diverges_throughout
 from .doubts import baseless, doubts
 from .experiment import experiments
 from .figures import figures
+from .found import Found
 from .location import location
-from .model import Model, gain, needed
-from .objective import Objective, Point, Unit, strengths_of
+from .model import Model
+from .objective import Objective, Point, Unit
 from .odd_runs import odd_run_alarms, odd_runs
 from .preparation import Prepared
-from .report import Candidate, Finding, Gap, Parameter, Report
+from .report import Candidate, Gap, Parameter, Report
 from .rollout import rollout_errors, worse_rollouts
 from .scatter import Scatter
 from .selection import Selection
-from .shrinkage import Shrinkage, shrinkage
+from .shrinkage import Shrinkage
 from .verdict import conclude
 
 Array = NDArray[np.float64]
-_WORTH = 0.01  # of the gap on test runs, to name chance beside another cause
+_TOLD = "as described", "with fitted parameters", "with the effects"
 
 
 def assemble(
@@ -70,12 +67,7 @@ def assemble(
         selection = settled(selection, max(credit, key=credit.__getitem__), prepared.sets)
     credit, best = credit_of(selection), selection.best
     points = _points(selection)
-    found = _with_chance(
-        _lasting(prepared, selection, credit, points=points, generator=generator),
-        scatter,
-        system.robot,
-        generator,
-    )
+    found = Found.of(prepared, selection, scatter, credit, points=points, generator=generator)
     seen = (
         *candidates(selection, found.confused, system.robot, alpha),
         *scatter.candidates(system.robot),
@@ -107,14 +99,16 @@ def assemble(
     names, measured = {effect.name for effect in found.effects}, found.measured
     left = measured.effects if names else measured.refit
     seen = concluded(seen, verdict, names, left=left)
-    alarms = [*prepared.alarms, *(str(f) for f in findings), *_absorbed(parameters)]
-    alarms += odd_run_alarms(odd)
-    named = ["as described", "with fitted parameters", "with the effects"][: 2 + bool(best.units)]
-    alarms += divergence_alarms(
-        prepared.sets["test"], dict(zip(named, points.values(), strict=False))
-    )
-    if names:
-        alarms += worse_rollouts(rollouts)
+    told = dict(zip(_TOLD[: 2 + bool(best.units)], points.values(), strict=False))
+    alarms = [
+        *prepared.alarms,
+        *(str(f) for f in findings),
+        *_absorbed(parameters),
+        *odd_run_alarms(odd),
+        *divergence_alarms(prepared.sets["test"], told),
+        *(worse_rollouts(rollouts) if names else ()),
+        *more,
+    ]
     return Report(
         verdict=verdict,
         summary=summary,
@@ -125,7 +119,7 @@ def assemble(
         gap=_gap(found.measured, prepared, rollouts),
         candidates=seen,
         parameters=parameters,
-        alarms=(*alarms, *more),
+        alarms=tuple(alarms),
         next_experiment=experiments(
             prepared, selection, found.confused, _not_excited(selection, seen), generator=generator
         ),
@@ -133,16 +127,6 @@ def assemble(
         strengths=found.strengths,
         figures=figures(prepared, selection, found.measured),
     )
-
-
-@dataclass(frozen=True)
-class _Found:
-    """What was found, and how far the gap shrinks with it."""
-
-    measured: Shrinkage
-    effects: tuple[Finding, ...]
-    strengths: Mapping[Effect, Mapping[str, float]]
-    confused: tuple[str, ...]
 
 
 def _every_unit(selection: Selection, scatter: Scatter) -> list[Unit]:
@@ -154,72 +138,6 @@ def _points(selection: Selection) -> dict[str, Point]:
     nominal = selection.nominal.fit.point
     zero = Point(np.zeros_like(nominal.z))
     return {"raw": zero, "refit": nominal, "with_effects": selection.best.fit.point}
-
-
-def _lasting(
-    prepared: Prepared,
-    selection: Selection,
-    credit: Mapping[str, float],
-    *,
-    points: Mapping[str, Point],
-    generator: np.random.Generator,
-) -> _Found:
-    """Return what the search found of effects that are the same in every run."""
-    robot = prepared.predictor.system.robot
-    measured = shrinkage(
-        prepared.sets["test"],
-        list(points.values()),
-        generator,
-        floor=_floor(selection, prepared.sets),
-        beside=prepared.sets["validation"],
-    )
-    confused = confusion_set(selection, max(credit, key=credit.__getitem__)) if credit else ()
-    effects = _effects(selection, credit, measured, robot)
-    return _Found(measured, effects, _by_target(selection.best.fit.point, robot), tuple(confused))
-
-
-def _with_chance(
-    found: _Found, scatter: Scatter, robot: Robot, generator: np.random.Generator
-) -> _Found:
-    """Return the same with the effects of chance, beside those that last or in their place."""
-    if scatter.beside:
-        measured = scatter.measured(found.measured, generator)
-        if measured.explained - found.measured.explained > _WORTH:
-            others = found.measured.explained
-            found = replace(
-                found,
-                measured=measured,
-                effects=(*found.effects, *scatter.findings(measured, robot, others=others)),
-                strengths={**found.strengths, **scatter.strengths(robot)},
-            )
-    elif scatter.hidden:
-        found = replace(found, confused=(*found.confused, *scatter.hidden))
-    elif scatter.found:
-        measured = scatter.measured(found.measured, generator)
-        effects = scatter.findings(measured, robot)
-        found = _Found(measured, effects, scatter.strengths(robot), scatter.names)
-    return _with_holds(found, scatter) if scatter.holds else found
-
-
-def _with_holds(found: _Found, scatter: Scatter) -> _Found:
-    """Return the same with samples that were not renewed, of the gap as it was recorded.
-
-    What explains next to nothing of that is a stopgap for what bridges leave.
-    """
-    measured, before = scatter.with_holds(found.measured), found.measured
-    gap = max(measured.refit - 1.0, 1e-9)
-    if measured.refit - before.refit <= _WORTH * gap:
-        return found
-    lasting, strengths, confused = found.effects, found.strengths, found.confused
-    if before.refit - before.effects <= _WORTH * gap:
-        lasting, strengths, confused = (), {}, ()
-    smaller = max(before.refit - 1.0, 0.0) / gap
-    lasting = tuple(replace(e, share_of_gap=smaller * e.share_of_gap) for e in lasting)
-    (held,) = scatter.held_findings(measured, sum(e.share_of_gap for e in lasting))
-    effects = sorted([*lasting, held], key=lambda e: -e.share_of_gap)
-    first = effects[0] is held or not confused
-    strengths = {**strengths, SensorDropout(): dict(held.strengths)}
-    return _Found(measured, tuple(effects), strengths, (held.name,) if first else confused)
 
 
 def _absorbed(parameters: Sequence[Parameter]) -> list[str]:
@@ -260,75 +178,11 @@ def _audit(
     }
 
 
-def _floor(selection: Selection, sets: Mapping[str, Objective]) -> float:
-    """Return the mean squared innovation that a perfect simulator leaves, at most 1.
-
-    Known where effects were found: what the best model leaves of the runs that it was found on.
-    """
-    best = selection.best
-    if not best.units:
-        return 1.0
-    parts = (best.fit.innovations, sets["train"]), (best.validation, sets["validation"])
-    left = sum(float((one**2).sum()) for one, _ in parts)
-    size = sum(float((o.whitening.weights**2).sum()) * one.shape[1] for one, o in parts)
-    return min(left / size, 1.0)
-
-
 def _not_excited(selection: Selection, candidates: Sequence[Candidate]) -> list[Unit]:
     """Return the units of effects that the data could have shown nowhere, at all targets first."""
     excited = {c.name for c in candidates if c.status != "not_excited"}
     units = dict.fromkeys(replace(u, onset=0.0) for u in selection.screens[0].units)
     return sorted((u for u in units if u.name not in excited), key=lambda u: u.where != "all")
-
-
-def _held_out(selection: Selection) -> float:
-    """Return how likely chance gains on validation what the best of all units gained there.
-
-    A gap that no small strength explains may be one that a large one does.
-    """
-    better = gain(selection.nominal, selection.best) - needed(selection.nominal, selection.best)
-    return float(min(1.0, len(selection.screens[0].units) * np.exp(-max(better, 0.0) / 2)))
-
-
-def _by_target(point: Point, robot: Robot) -> dict[Effect, dict[str, float]]:
-    """Return strengths by effect and name of the target, zeros left out."""
-    return {
-        effect: {
-            name: float(s) for name, s in zip(effect.targets(robot), strength[0], strict=True) if s
-        }
-        for effect, strength in strengths_of([point], robot).items()
-    }
-
-
-def _effects(
-    selection: Selection, credit: Mapping[str, float], measured: Shrinkage, robot: Robot
-) -> tuple[Finding, ...]:
-    """Return the effects of the best model, units of one effect together."""
-    best = selection.best
-    size = len(best.fit.point.z)
-    errors = strength_errors(best.fit, best.dispersion(), size)
-    p_value = min(selection.p_values[0], _held_out(selection))
-    found = []
-    for name in dict.fromkeys(u.name for u in best.units):
-        units = [u for u in best.units if u.name == name]
-        strengths = [u.actual(best.fit.point.strengths[u]) for u in units]
-        mean = float(np.mean(strengths))
-        error = float(np.sqrt(np.sum([errors[u] ** 2 for u in units])) / len(units))
-        found.append(
-            Finding(
-                name=name,
-                where=units[0].where if len({u.where for u in units}) == 1 else "all",
-                strength=mean,
-                unit=unit_at(units[0].effect, robot, int(np.argmax(units[0].direction))),
-                ci95=(mean - 1.96 * error, mean + 1.96 * error),
-                p_value=p_value,
-                share_of_gap=max(0.0, credit.get(name, 0.0) * measured.explained),
-                strengths={u.where: s for u, s in zip(units, strengths, strict=True)},
-                form=units[int(np.argmax(np.abs(strengths)))].effect.form,
-                rivals=tuple(confusion_set(selection, name)[1:]),
-            )
-        )
-    return tuple(sorted(found, key=lambda f: -f.share_of_gap))
 
 
 def _parameters(system: System, prepared: Prepared, selection: Selection) -> tuple[Parameter, ...]:

@@ -1,0 +1,197 @@
+"""What was found: effects with their strengths, and how far the gap shrinks with them."""
+
+from __future__ import annotations
+
+__all__ = ["Found"]
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..effects.effect import Effect
+from ..effects.robot import Robot
+from ..effects.sensors import SensorDropout
+from ..effects.units import unit_at
+from .candidates import strength_errors
+from .confusion import confusion_set
+from .model import gain, needed
+from .objective import Objective, Point, strengths_of
+from .preparation import Prepared
+from .report import Finding
+from .scatter import Scatter
+from .selection import Selection
+from .shrinkage import Shrinkage, shrinkage
+
+_WORTH = 0.01  # of the gap on test runs, to name chance beside another cause
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was found, and how far the gap shrinks with it.
+
+    Attributes:
+        measured: How far it shrinks.
+        effects: What was found, as the report has it.
+        strengths: By effect and target, as `Report.apply` sets them.
+        confused: Names that cannot be told from the first cause, itself first.
+    """
+
+    measured: Shrinkage
+    effects: tuple[Finding, ...]
+    strengths: Mapping[Effect, Mapping[str, float]]
+    confused: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls,
+        prepared: Prepared,
+        selection: Selection,
+        scatter: Scatter,
+        credit: Mapping[str, float],
+        *,
+        points: Mapping[str, Point],
+        generator: np.random.Generator,
+    ) -> Found:
+        """Return what the search found, and what was found of chance.
+
+        Args:
+            prepared: Split, noise, horizon, nominal fit.
+            selection: What the search found.
+            scatter: What was found of effects of chance.
+            credit: Each effect's share of the deviance that all remove.
+            points: The simulator at the prior's mean, with fitted parameters, and with effects.
+            generator: Of the bootstrap.
+        """
+        lasting = _lasting(prepared, selection, credit, points=points, generator=generator)
+        return _with_chance(lasting, scatter, prepared.predictor.system.robot, generator)
+
+
+def _lasting(
+    prepared: Prepared,
+    selection: Selection,
+    credit: Mapping[str, float],
+    *,
+    points: Mapping[str, Point],
+    generator: np.random.Generator,
+) -> Found:
+    """Return what the search found of effects that are the same in every run."""
+    robot = prepared.predictor.system.robot
+    measured = shrinkage(
+        prepared.sets["test"],
+        list(points.values()),
+        generator,
+        floor=_floor(selection, prepared.sets),
+        beside=prepared.sets["validation"],
+    )
+    confused = confusion_set(selection, max(credit, key=credit.__getitem__)) if credit else ()
+    effects = _effects(selection, credit, measured, robot)
+    return Found(measured, effects, _by_target(selection.best.fit.point, robot), tuple(confused))
+
+
+def _with_chance(
+    found: Found, scatter: Scatter, robot: Robot, generator: np.random.Generator
+) -> Found:
+    """Return the same with the effects of chance, beside those that last or in their place."""
+    if scatter.beside:
+        measured = scatter.measured(found.measured, generator)
+        if measured.explained - found.measured.explained > _WORTH:
+            others = found.measured.explained
+            found = replace(
+                found,
+                measured=measured,
+                effects=(*found.effects, *scatter.findings(measured, robot, others=others)),
+                strengths={**found.strengths, **scatter.strengths(robot)},
+            )
+    elif scatter.hidden:
+        found = replace(found, confused=(*found.confused, *scatter.hidden))
+    elif scatter.found:
+        measured = scatter.measured(found.measured, generator)
+        effects = scatter.findings(measured, robot)
+        found = Found(measured, effects, scatter.strengths(robot), scatter.names)
+    return _with_holds(found, scatter) if scatter.holds else found
+
+
+def _with_holds(found: Found, scatter: Scatter) -> Found:
+    """Return the same with samples that were not renewed, of the gap as it was recorded.
+
+    What explains next to nothing of that is a stopgap for what bridges leave.
+    """
+    measured, before = scatter.with_holds(found.measured), found.measured
+    gap = max(measured.refit - 1.0, 1e-9)
+    if measured.refit - before.refit <= _WORTH * gap:
+        return found
+    lasting, strengths, confused = found.effects, found.strengths, found.confused
+    if before.refit - before.effects <= _WORTH * gap:
+        lasting, strengths, confused = (), {}, ()
+    smaller = max(before.refit - 1.0, 0.0) / gap
+    lasting = tuple(replace(e, share_of_gap=smaller * e.share_of_gap) for e in lasting)
+    (held,) = scatter.held_findings(measured, sum(e.share_of_gap for e in lasting))
+    effects = sorted([*lasting, held], key=lambda e: -e.share_of_gap)
+    first = effects[0] is held or not confused
+    strengths = {**strengths, SensorDropout(): dict(held.strengths)}
+    return Found(measured, tuple(effects), strengths, (held.name,) if first else confused)
+
+
+def _floor(selection: Selection, sets: Mapping[str, Objective]) -> float:
+    """Return the mean squared innovation that a perfect simulator leaves, at most 1.
+
+    Known where effects were found: what the best model leaves of the runs that it was found on.
+    """
+    best = selection.best
+    if not best.units:
+        return 1.0
+    parts = (best.fit.innovations, sets["train"]), (best.validation, sets["validation"])
+    left = sum(float((one**2).sum()) for one, _ in parts)
+    size = sum(float((o.whitening.weights**2).sum()) * one.shape[1] for one, o in parts)
+    return min(left / size, 1.0)
+
+
+def _held_out(selection: Selection) -> float:
+    """Return how likely chance gains on validation what the best of all units gained there.
+
+    A gap that no small strength explains may be one that a large one does.
+    """
+    better = gain(selection.nominal, selection.best) - needed(selection.nominal, selection.best)
+    return float(min(1.0, len(selection.screens[0].units) * np.exp(-max(better, 0.0) / 2)))
+
+
+def _by_target(point: Point, robot: Robot) -> dict[Effect, dict[str, float]]:
+    """Return strengths by effect and name of the target, zeros left out."""
+    return {
+        effect: {
+            name: float(s) for name, s in zip(effect.targets(robot), strength[0], strict=True) if s
+        }
+        for effect, strength in strengths_of([point], robot).items()
+    }
+
+
+def _effects(
+    selection: Selection, credit: Mapping[str, float], measured: Shrinkage, robot: Robot
+) -> tuple[Finding, ...]:
+    """Return the effects of the best model, units of one effect together."""
+    best = selection.best
+    size = len(best.fit.point.z)
+    errors = strength_errors(best.fit, best.dispersion(), size)
+    p_value = min(selection.p_values[0], _held_out(selection))
+    found = []
+    for name in dict.fromkeys(u.name for u in best.units):
+        units = [u for u in best.units if u.name == name]
+        strengths = [u.actual(best.fit.point.strengths[u]) for u in units]
+        mean = float(np.mean(strengths))
+        error = float(np.sqrt(np.sum([errors[u] ** 2 for u in units])) / len(units))
+        found.append(
+            Finding(
+                name=name,
+                where=units[0].where if len({u.where for u in units}) == 1 else "all",
+                strength=mean,
+                unit=unit_at(units[0].effect, robot, int(np.argmax(units[0].direction))),
+                ci95=(mean - 1.96 * error, mean + 1.96 * error),
+                p_value=p_value,
+                share_of_gap=max(0.0, credit.get(name, 0.0) * measured.explained),
+                strengths={u.where: s for u, s in zip(units, strengths, strict=True)},
+                form=units[int(np.argmax(np.abs(strengths)))].effect.form,
+                rivals=tuple(confusion_set(selection, name)[1:]),
+            )
+        )
+    return tuple(sorted(found, key=lambda f: -f.share_of_gap))
