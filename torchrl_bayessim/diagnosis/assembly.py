@@ -158,7 +158,7 @@ def _gap(measured: Shrinkage, prepared: Prepared, rollouts: Mapping[str, Any]) -
         floor=1.0,
         explained_fraction=measured.explained,
         ci95=measured.elsewhere,
-        by_parameters=(measured.raw - measured.refit) / max(measured.raw - 1.0, 1e-9),
+        by_parameters=measured.by_parameters,
         rollout_rmse=rollouts,
     )
 

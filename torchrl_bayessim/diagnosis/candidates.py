@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from ..effects.robot import Robot
-from ..effects.units import unit_at
 from .objective import Unit
 from .refit import Fit
 from .report import Candidate, Verdict
@@ -67,7 +66,7 @@ def candidates(
                 explained_by_parameters=swallowed[unit],
                 minimal_detectable_strength=unit.actual(least) if np.isfinite(least) else None,
                 form=unit.effect.form,
-                unit=unit_at(unit.effect, robot, int(np.argmax(unit.direction))),
+                unit=unit.measured_in(robot),
                 status=_status(
                     unit,
                     used,

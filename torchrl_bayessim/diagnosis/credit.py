@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["apart", "credit_of", "shares", "unit_credit", "worthwhile"]
+__all__ = ["credit_of", "shares", "unit_credit", "worthwhile"]
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -25,7 +25,7 @@ def worthwhile(selection: Selection, sets: Mapping[str, Objective]) -> Selection
     nothing.
     """
     while True:
-        selection = apart(selection, sets)
+        selection = _apart(selection, sets)
         credit = credit_of(selection)
         least = min(credit, key=credit.__getitem__, default="")
         if len(credit) < 2 or credit[least] >= _LEAST:
@@ -39,7 +39,7 @@ def worthwhile(selection: Selection, sets: Mapping[str, Objective]) -> Selection
         selection = replace(selection, best=best, alternatives=others)
 
 
-def apart(selection: Selection, sets: Mapping[str, Objective]) -> Selection:
+def _apart(selection: Selection, sets: Mapping[str, Objective]) -> Selection:
     """Return the selection with all fits without one of the effects among what was tried.
 
     Effects that were added together may never have been fitted one by one.

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..effects.robot import Robot
-from ..effects.units import unit_at
 from .location import excess, signature_curves
 from .objective import Objective, Point, Unit, pushes_of, strengths_of
 from .prediction import Predictor
@@ -140,7 +139,7 @@ def _signature(prepared: Prepared, selection: Selection) -> dict[str, Any]:
     push = next(unit for unit in pushes if unit.where == joint)
     return {
         "joint": joint,
-        "unit": unit_at(push.effect, robot, push.direction.index(1.0)),
+        "unit": push.measured_in(robot),
         "curves": {
             name: {
                 when: _binned(np.array(c[name]["x"]), np.array(c[name]["force"]))
@@ -235,8 +234,4 @@ def _heat(judged: Objective, point: Point) -> dict[str, Any]:
 
 def _units(units: set[Unit], robot: Robot) -> dict[str, str]:
     """Return the unit of each effect's strength, by ``effect[target]``."""
-    found = {}
-    for unit in units:
-        largest = max(range(len(unit.direction)), key=lambda i: abs(unit.direction[i]))
-        found[str(unit)] = unit_at(unit.effect, robot, largest)
-    return found
+    return {str(unit): unit.measured_in(robot) for unit in units}

@@ -12,7 +12,6 @@ import numpy as np
 from ..effects.effect import Effect
 from ..effects.robot import Robot
 from ..effects.sensors import SensorDropout
-from ..effects.units import unit_at
 from .candidates import strength_errors
 from .confusion import confusion_set
 from .model import gain, needed
@@ -63,30 +62,22 @@ class Found:
             points: The simulator at the prior's mean, with fitted parameters, and with effects.
             generator: Of the bootstrap.
         """
-        lasting = _lasting(prepared, selection, credit, points=points, generator=generator)
-        return _with_chance(lasting, scatter, prepared.predictor.system.robot, generator)
-
-
-def _lasting(
-    prepared: Prepared,
-    selection: Selection,
-    credit: Mapping[str, float],
-    *,
-    points: Mapping[str, Point],
-    generator: np.random.Generator,
-) -> Found:
-    """Return what the search found of effects that are the same in every run."""
-    robot = prepared.predictor.system.robot
-    measured = shrinkage(
-        prepared.sets["test"],
-        list(points.values()),
-        generator,
-        floor=_floor(selection, prepared.sets),
-        beside=prepared.sets["validation"],
-    )
-    confused = confusion_set(selection, max(credit, key=credit.__getitem__)) if credit else ()
-    effects = _effects(selection, credit, measured, robot)
-    return Found(measured, effects, _by_target(selection.best.fit.point, robot), tuple(confused))
+        robot = prepared.predictor.system.robot
+        measured = shrinkage(
+            prepared.sets["test"],
+            list(points.values()),
+            generator,
+            floor=_floor(selection, prepared.sets),
+            beside=prepared.sets["validation"],
+        )
+        equals = {name: confusion_set(selection, name) for name in credit}
+        lasting = cls(
+            measured,
+            _effects(selection, credit, equals, measured, robot=robot),
+            _by_target(selection.best.fit.point, robot),
+            equals[max(credit, key=credit.__getitem__)] if credit else (),
+        )
+        return _with_chance(lasting, scatter, robot, generator)
 
 
 def _with_chance(
@@ -167,7 +158,12 @@ def _by_target(point: Point, robot: Robot) -> dict[Effect, dict[str, float]]:
 
 
 def _effects(
-    selection: Selection, credit: Mapping[str, float], measured: Shrinkage, robot: Robot
+    selection: Selection,
+    credit: Mapping[str, float],
+    equals: Mapping[str, tuple[str, ...]],
+    measured: Shrinkage,
+    *,
+    robot: Robot,
 ) -> tuple[Finding, ...]:
     """Return the effects of the best model, units of one effect together."""
     best = selection.best
@@ -175,7 +171,7 @@ def _effects(
     errors = strength_errors(best.fit, best.dispersion(), size)
     p_value = min(selection.p_values[0], _held_out(selection))
     found = []
-    for name in dict.fromkeys(u.name for u in best.units):
+    for name, confused in equals.items():
         units = [u for u in best.units if u.name == name]
         strengths = [u.actual(best.fit.point.strengths[u]) for u in units]
         mean = float(np.mean(strengths))
@@ -185,13 +181,13 @@ def _effects(
                 name=name,
                 where=units[0].where if len({u.where for u in units}) == 1 else "all",
                 strength=mean,
-                unit=unit_at(units[0].effect, robot, int(np.argmax(units[0].direction))),
+                unit=units[0].measured_in(robot),
                 ci95=(mean - 1.96 * error, mean + 1.96 * error),
                 p_value=p_value,
-                share_of_gap=max(0.0, credit.get(name, 0.0) * measured.explained),
+                share_of_gap=max(0.0, credit[name] * measured.explained),
                 strengths={u.where: s for u, s in zip(units, strengths, strict=True)},
                 form=units[int(np.argmax(np.abs(strengths)))].effect.form,
-                rivals=tuple(confusion_set(selection, name)[1:]),
+                rivals=confused[1:],
             )
         )
     return tuple(sorted(found, key=lambda f: -f.share_of_gap))

@@ -188,7 +188,7 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
         units: Random effects at their targets; of those lost commands, of one actuator or of all
             at once, and samples of one target.
     """
-    some = [u for u in units if isinstance(u.effect, PacketDrop | SensorDropout) and _single(u)]
+    some = [u for u in units if isinstance(u.effect, PacketDrop | SensorDropout) and _as_one(u)]
     if not some or type(prepared.mode) is not Mode:
         return []
     nominal = _cut(prepared)
@@ -251,7 +251,7 @@ def _spoiled(told: Told) -> float:
     return float((told.spoiled > _LIKELIER).mean())
 
 
-def _single(unit: Unit) -> bool:
+def _as_one(unit: Unit) -> bool:
     """Return whether a unit is lost as one: a packet holds all commands, but no reading of all."""
     alone = unit.where != "all" or len(unit.direction) == 1
     return alone or isinstance(unit.effect, PacketDrop)

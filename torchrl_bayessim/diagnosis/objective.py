@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 from ..effects.disturbance import ConstantForce
 from ..effects.effect import Effect
 from ..effects.robot import Robot
+from ..effects.units import unit_at
 from ..inference.priors import Prior
 from .prediction import Predictor
 from .segments import Segments
@@ -87,6 +88,10 @@ class Unit:
         """Return the joint at which it acts, -1 where there is none or there are several."""
         targets = [i for i, part in enumerate(self.direction) if part]
         return self.effect.joint(robot, targets[0]) if len(targets) == 1 else -1
+
+    def measured_in(self, robot: Robot) -> str:
+        """Return the unit of its strength; at all together, where it is largest."""
+        return unit_at(self.effect, robot, int(np.argmax(np.abs(self.direction))))
 
     def __str__(self) -> str:
         return f"{self.effect.name}[{self.where}]"

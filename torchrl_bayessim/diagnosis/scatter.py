@@ -13,7 +13,6 @@ import numpy as np
 from ..effects.effect import Effect
 from ..effects.robot import Robot
 from ..effects.sensors import SensorDropout
-from ..effects.units import unit_at
 from ..logs.log import Log
 from .chance import Chance
 from .contacts import settled
@@ -158,7 +157,7 @@ class Scatter:
                 name=first.unit.name,
                 where=first.unit.where,
                 strength=first.strength,
-                unit=unit_at(first.unit.effect, robot, int(np.argmax(first.unit.direction))),
+                unit=first.unit.measured_in(robot),
                 ci95=(max(first.strength - half, 0.0), first.strength + half),
                 p_value=float(np.exp(-first.gain / 2)),
                 share_of_gap=max(measured.explained - others, 0.0),
@@ -178,15 +177,9 @@ class Scatter:
 
     def candidates(self, robot: Robot) -> list[Candidate]:
         """Return what the data say of each that was looked for."""
-        return [
-            replace(
-                self._candidate(unit, least),
-                unit=unit_at(unit.effect, robot, int(np.argmax(unit.direction))),
-            )
-            for unit, least in self.least.items()
-        ]
+        return [self._candidate(unit, least, robot) for unit, least in self.least.items()]
 
-    def _candidate(self, unit: Unit, least: float) -> Candidate:
+    def _candidate(self, unit: Unit, least: float, robot: Robot) -> Candidate:
         strength, error, gain = self._known(unit)
         return Candidate(
             name=unit.name,
@@ -201,6 +194,7 @@ class Scatter:
             minimal_detectable_strength=least if np.isfinite(least) else None,
             status=self._status(unit, least),
             form=unit.effect.form,
+            unit=unit.measured_in(robot),
         )
 
     def _known(self, unit: Unit) -> tuple[float, float, float]:

@@ -98,10 +98,10 @@ def _retuned(measured: Shrinkage, *, fitted: bool, found: bool) -> str:
     50 % of which parameters and effects explain together.'
     """
     if fitted and measured.raw > measured.refit:
-        share = (measured.raw - measured.refit) / max(measured.raw - 1.0, 1e-9)
+        share = _percent(min(measured.by_parameters, 1.0))
         return (
-            f" Retuning parameters alone removes {_percent(min(share, 1.0))} of the gap as "
-            f"described ({measured.raw:.3g} times the floor)."
+            f" Retuning parameters alone removes {share} of the gap as described "
+            f"({measured.raw:.3g} times the floor)."
         )
     if not measured.misled:
         return ""

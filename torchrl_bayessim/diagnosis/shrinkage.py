@@ -50,6 +50,11 @@ class Shrinkage:
     remainder_ci: tuple[float, float]
 
     @property
+    def by_parameters(self) -> float:
+        """Share of the excess as described that fitting parameters alone removes."""
+        return (self.raw - self.refit) / max(self.raw - 1.0, 1e-9)
+
+    @property
     def misled(self) -> bool:
         """Whether parameters that were fitted to other runs do worse than those as described."""
         return self.refit > _WORSE * self.raw
