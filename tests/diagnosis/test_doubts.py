@@ -84,6 +84,7 @@ def test_a_share_that_may_be_nothing_is_named_with_reserve(low, verdict):
         validated=0.9,
         unsaid=False,
         elsewhere=False,
+        helps=False,
         several=False,
     )
     assert weighed.named(ambiguous=False) == verdict

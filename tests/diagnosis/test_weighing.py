@@ -10,13 +10,14 @@ from torchrl_bayessim.diagnosis.verdict import _Weighed
 
 
 def verdict(
-    *, refit, left, sure, chance=False, validation=(1.0, 1.0), raw=9.0, ci=(-2.0, 1.0), count=1
-):
+    *, refit, left, sure, chance=False, validation=(1.0, 1.0), raw=9.0, ci=(-2.0, 1.0), count=1,
+    by_chance=1.0,
+):  # fmt: skip
     """Return the verdict on one effect: mean squared innovations of test runs and validation."""
     explained = (refit - left) / max(refit - 1.0, 1e-9)
     share = float(np.clip(explained, -1.0, 1.0))
     excess = (-0.2, 0.3) if refit < 1.05 else (0.5 * (refit - 1.0), 2 * refit)
-    measured = Shrinkage(raw, refit, left, share, ci, excess, (left - 1.1, left - 0.9))
+    measured = Shrinkage(raw, refit, left, share, ci, excess, (left - 1.1, left - 0.9), by_chance)
     models = [
         SimpleNamespace(
             units=units,
@@ -88,3 +89,18 @@ def test_two_effects_may_leave_less_than_one(count, left, said):
         count=count,
     )  # fmt: skip
     assert answer == said
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "named_partial"),  # a third of it, perhaps more
+        ({"ci": (0.25, 0.35)}, "unknown"),  # surely less than 40 %
+        ({"refit": 3.5, "left": 2.6}, "unknown"),  # more than the noise once more remains
+        ({"by_chance": 0.05}, "unknown"),
+        ({"sure": 1e-12}, "unknown"),
+    ],
+)
+def test_a_certain_cause_that_surely_helps_is_named_with_what_remains(changes, said):
+    known = {"refit": 2.0, "left": 1.67, "sure": 1e-20, "ci": (0.25, 0.6), "by_chance": 1e-4}
+    assert verdict(validation=(2.0, 1.6), **(known | changes)) == said

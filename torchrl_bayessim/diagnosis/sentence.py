@@ -60,7 +60,8 @@ def sentence(
         return f"{gap} It is real, {real}{parameters}{untested}"
     causes = ", and ".join(_described(e) for e in effects)
     low, high = measured.elsewhere
-    share = f"explains {_percent(measured.explained)} [{100 * low:.0f}, {100 * high:.0f}] of it"
+    least, most = (f"{100 * max(end, 0.0):.0f}" for end in (low, high))
+    share = f"explains {_percent(measured.explained)} [{least}, {most}] of it"
     if validated is not None:
         share = f"explains {_percent(validated)} of it on validation runs, test runs hardly show it"
     elif measured.refit <= NEGLIGIBLE:

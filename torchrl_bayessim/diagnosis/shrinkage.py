@@ -14,11 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from .objective import Objective, Point
 
 Array = NDArray[np.float64]
 _DRAWS = 1000
+_FEWEST = 3  # segments, to say whether they are predicted better
 _LOGS = 4  # from which on whole trajectories are resampled
 _FLOOR_ERROR = 0.05  # relative standard deviation of a noise floor, squared units
 # Other motions differ by more than those of a few logs do. Of 86 robots whose cause was known and
@@ -39,6 +41,8 @@ class Shrinkage:
         explained_ci: Its interval, for motions such as these.
         excess_ci: Interval of ``refit - 1``.
         remainder_ci: Interval of ``effects - 1``.
+        p_value: Of test segments' being predicted better with the effects by chance: one-sided, of
+            Student's test on the differences of their squares.
     """
 
     raw: float
@@ -48,6 +52,7 @@ class Shrinkage:
     explained_ci: tuple[float, float]
     excess_ci: tuple[float, float]
     remainder_ci: tuple[float, float]
+    p_value: float = 1.0
 
     @property
     def by_parameters(self) -> float:
@@ -103,12 +108,16 @@ def shrinkage(
             for more than there is. All figures are in units of it.
         beside: Segments of the validation runs.
     """
-    own = _sums(test, points, floor)
+    each = squares(test, points, np.arange(len(test.segments)))
+    own = _grouped(test, each, floor)
     raw, refit, effects = (float(s.sum() / own[3].sum()) for s in own[:3])
     # noise may leave less than its mean; more than all cannot be explained
     explained = min((refit - effects) / (refit - 1.0), 1.0) if refit > 1.0 else 0.0
     _, refits, after = _resampled(own, generator)
-    wider = own if beside is None else np.concatenate([own, _sums(beside, points, floor)], 1)
+    wider = own
+    if beside is not None:
+        others = squares(beside, points, np.arange(len(beside.segments)))
+        wider = np.concatenate([own, _grouped(beside, others, floor)], 1)
     _, before, left = _resampled(wider, generator)
     least = np.minimum(left, 1.0) * (1.0 + _FLOOR_ERROR * generator.standard_normal(len(left)))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -117,18 +126,28 @@ def shrinkage(
     return Shrinkage(
         raw, refit, effects, explained,
         (min(low, explained), max(high, explained)),
-        _interval(refits - 1.0), _interval(after - 1.0),
+        _interval(refits - 1.0), _interval(after - 1.0), _better(each[1] - each[2]),
     )  # fmt: skip
 
 
-def _sums(objective: Objective, points: Sequence[Point], floor: float) -> Array:
+def _grouped(objective: Objective, each: Array, floor: float) -> Array:
     """Return squares of the three points and their number, summed over units to resample."""
-    groups = objective.segments.log
-    if len(np.unique(groups)) < _LOGS:
-        groups = np.arange(len(groups))
-    sums = squares(objective, points, groups)
-    sums[-1] *= floor
-    return sums
+    groups, index = np.unique(objective.segments.log, return_inverse=True)
+    if len(groups) >= _LOGS:
+        each = np.array([np.bincount(index, one, len(groups)) for one in each], dtype=np.float64)
+    return each * np.array([1.0, 1.0, 1.0, floor])[:, None]
+
+
+def _better(gains: Array) -> float:
+    """Return how often chance alone makes the mean of gains as large.
+
+    Example:
+        >>> _better(np.array([1.0, 2.0, 3.0])) < 0.05, _better(np.zeros(3)), _better(np.ones(1))
+        (True, 1.0, 1.0)
+    """
+    if len(gains) < _FEWEST or not gains.any():
+        return 1.0
+    return float(stats.ttest_1samp(gains, 0.0, alternative="greater").pvalue)
 
 
 def squares(objective: Objective, points: Sequence[Point], groups: NDArray[np.int64]) -> Array:

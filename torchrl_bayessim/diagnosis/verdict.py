@@ -7,7 +7,8 @@ how much of it the effects explain, not only whether it is significant::
     named          effects explain at least 80 %, surely 40 %, and what is left is not significant,
                    or 2 % and no more than the noise, of several effects a fifth of it
     named_partial  effects explain at least 40 %; the rest is located. Or 80 % on validation runs,
-                   where test runs hardly show the gap
+                   where test runs hardly show the gap. Or perhaps 40 %, of a cause that is certain
+                   and surely helps on test runs, and leaves less than the noise once more
     ambiguous      effects of different kinds explain the data equally well
     unknown        the gap is real, and the catalogue explains less than 40 % of it, or perhaps none
     not_testable   the data are too few or too uniform to say
@@ -131,6 +132,7 @@ class _Weighed:
         validated: Share of the gap that is explained on validation runs.
         unsaid: Whether test runs do not say that what was found explains it.
         elsewhere: Whether validation runs do in their place.
+        helps: Whether it surely helps on test runs, however much of the gap it explains.
         several: Whether several effects were found.
     """
 
@@ -141,6 +143,7 @@ class _Weighed:
     validated: float
     unsaid: bool
     elsewhere: bool
+    helps: bool
     several: bool
 
     @classmethod
@@ -170,11 +173,14 @@ class _Weighed:
         contradicted = measured.effects > SHOWN * measured.refit  # by what test runs do show
         elsewhere = unsaid and hardly_shown(measured) and validated >= enough(p_value)
         elsewhere &= not contradicted
+        helps = certain and measured.p_value < alpha and measured.explained_ci[1] >= PARTIAL
+        helps &= measured.effects <= _NOISE_AGAIN
         borne_out = certain or measured.effects < measured.refit or validated >= PARTIAL
         found = p_value <= alpha and borne_out and bool(selection.best.units)
         significant = found or by_chance
+        several = len(effects) > 1
         return cls(
-            measured, significant, certain, visible, validated, unsaid, elsewhere, len(effects) > 1
+            measured, significant, certain, visible, validated, unsaid, elsewhere, helps, several
         )
 
     def named(self, *, ambiguous: bool) -> Verdict:
@@ -185,7 +191,8 @@ class _Weighed:
             return "named_partial" if self.significant else "none"
         if self.unsaid:
             sure = self.visible or self.certain
-            return "named_partial" if self.elsewhere else "unknown" if sure else "none"
+            borne_out = self.elsewhere or self.helps
+            return "named_partial" if borne_out else "unknown" if sure else "none"
         if ambiguous:
             return "ambiguous"
         # of a large gap, 2 % may be ten times the noise: proof that the law is another one; two
