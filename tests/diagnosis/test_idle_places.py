@@ -76,3 +76,10 @@ def test_what_has_the_same_beside_something_else_says_nothing_against_an_effect(
     """A fiftieth of the gap, of which the new effect leaves nothing; a rival is as good."""
     start, base, better = model([], 1e6), model([A], 20_000.0), model([A, C], 450.0)
     assert _identified(start, base, better, [better, model(rival, 448.0)]) == added
+
+
+@pytest.mark.parametrize(("other", "added"), [(19_500.0, True), (17_000.0, False)])
+def test_a_third_of_what_is_left_is_enough_where_no_other_kind_comes_near(other, added):
+    start, base, better = model([], 1e6), model([A], 20_000.0), model([A, C], 13_500.0)
+    rival = model([A, Unit("delay", "x")], other)
+    assert _identified(start, base, better, [better, rival]) == added

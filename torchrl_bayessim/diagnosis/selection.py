@@ -25,6 +25,7 @@ from .screening import Screen
 
 _SHARE = 0.1  # of the gap: what an effect that could be another must remove to be kept
 _REST = 0.5  # of what the base leaves: what any further effect must remove
+_LONE, _ALONE = 0.25, 4.0  # the same where it removes so many times what any other kind does
 _REMAINS = 0.01  # of the gap: not worth another effect
 _WRONG = 1.5  # mean squared innovation of a base that something is missing from
 _SURELY, _NOTHING = 50.0, 0.2  # gain, and share of what the base leaves: it was just this
@@ -224,24 +225,31 @@ def _identified(start: Model, base: Model, better: Model, models: Sequence[Model
         return True
     if _all_explained(start, base):
         return False
-    alone, before, after = (
-        float(np.mean(np.r_[(m.fit.innovations**2).ravel(), (m.validation**2).ravel()]))
-        for m in (start, base, better)
-    )
+    alone, before, after = (_mean_square(m) for m in (start, base, better))
     if before - after > _SHARE * (alone - 1.0):
         return True
-    if before - after < _REST * (before - 1.0):
+    added = _added(base, better)
+    others = [m for m in models if not _added(base, m) & added]
+    next_best = before - min([before, *(_mean_square(m) for m in others)])
+    lone = before - after > _ALONE * next_best
+    if before - after < (_LONE if lone else _REST) * (before - 1.0):
         return False
-    added = {u.effect.group for u in better.units if u not in base.units}
-    rivals = [
-        {u.effect.group for u in m.units if u not in base.units}
-        for m in models
-        if m is not better and as_good(better, m)
-    ]
+    rivals = [_added(base, m) for m in models if m is not better and as_good(better, m)]
     just_this = gain(base, better) > _SURELY and after - 1.0 < _NOTHING * (before - 1.0)
     # what has the same beside something else says nothing against it
     alike = all(groups <= added or added <= groups for groups in rivals)
     return (before > _WRONG or just_this) and alike
+
+
+def _mean_square(model: Model) -> float:
+    """Return the mean squared innovation of training and validation."""
+    parts = model.fit.innovations.ravel(), model.validation.ravel()
+    return float((np.concatenate(parts) ** 2).mean())
+
+
+def _added(base: Model, model: Model) -> set[str]:
+    """Return the kinds of what a model has beside those of its base."""
+    return {unit.effect.group for unit in model.units if unit not in base.units}
 
 
 def _eliminated(train: Objective, validation: Objective, model: Model) -> tuple[Model, list[Model]]:
