@@ -218,6 +218,17 @@ def test_the_frequency_of_a_disturbance_is_found():
     assert {k: v for k, v in told["candidates"][-1].items() if k == "form"} == {"form": {}}
 
 
+def test_what_a_larger_cause_hides_is_given_its_frequency_beside_it():
+    data = logs(push=lambda q, v: 0.06 * np.sin(9 * q + 1.0) - 1.5 * q)
+    effects = "parallel_spring", "cogging", "coulomb_friction", "constant_force"
+    report = diagnose(system(), None, data, effects=effects)
+    spring, cogging = report.effects
+    assert spring.strength == pytest.approx(1.5, rel=0.02)
+    assert cogging.strength == pytest.approx(0.06, rel=0.2)
+    assert cogging.form["number"] == 9.0
+    assert [c.name for c in report.candidates if c.status == "named"] == [spring.name, cogging.name]
+
+
 def test_a_late_command_is_named_with_what_it_cannot_be_told_from():
     report = diagnose(system(), None, logs(act=lambda u, k: u[max(0, k - 2)]), effects=SOME)
     assert {"action_delay", "sensor_delay"} & set(report.confusion_set)

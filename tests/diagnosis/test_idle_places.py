@@ -8,8 +8,9 @@ import pytest
 
 from torchrl_bayessim.diagnosis.alternatives import exchanged
 from torchrl_bayessim.diagnosis.credit import worthwhile
+from torchrl_bayessim.diagnosis.further_effects import identified
 from torchrl_bayessim.diagnosis.model import Model
-from torchrl_bayessim.diagnosis.selection import Selection, _identified, _idle_place
+from torchrl_bayessim.diagnosis.selection import Selection, _idle_place
 
 
 class Unit(NamedTuple):
@@ -24,9 +25,9 @@ class Unit(NamedTuple):
 A, B, C = Unit("gain", "knee"), Unit("gain", "hip"), Unit("friction", "hip")
 
 
-def model(units, deviance, *, segments=40):
-    """Return a model whose segments all leave as much."""
-    left = np.full((segments // 2, 10), np.sqrt(deviance / (10 * segments)))
+def model(units, deviance, *, segments=40, flipped=False):
+    """Return a model whose segments all leave as much, on the other side if ``flipped``."""
+    left = np.full((segments // 2, 10), np.sqrt(deviance / (10 * segments))) * (-1) ** flipped
     fit = SimpleNamespace(units=tuple(units), innovations=left)
     return Model(fit=fit, validation=left, logs=np.arange(segments))
 
@@ -73,13 +74,27 @@ def test_more_strengths_do_not_take_the_place_of_fewer_that_are_as_good(share, c
     ("rival", "added"), [([A, C, Unit("delay", "x")], True), ([A, Unit("delay", "x")], False)]
 )
 def test_what_has_the_same_beside_something_else_says_nothing_against_an_effect(rival, added):
-    """A fiftieth of the gap, of which the new effect leaves nothing; a rival is as good."""
-    start, base, better = model([], 1e6), model([A], 20_000.0), model([A, C], 450.0)
-    assert _identified(start, base, better, [better, model(rival, 448.0)]) == added
+    """A fiftieth of the gap, most of which the new effect explains; a rival is as good."""
+    start, base, better = model([], 1e6), model([A], 20_000.0), model([A, C], 4000.0)
+    rivals = [better, model(rival, 3990.0, flipped=True)]
+    assert identified(start, base, better, rivals) == added
+
+
+def test_what_explains_the_same_under_another_name_says_nothing_against_an_effect():
+    start, base, better = model([], 1e6), model([A], 20_000.0), model([A, C], 4000.0)
+    other = model([A, Unit("delay", "x")], 3990.0)
+    assert identified(start, base, better, [better, other])
 
 
 @pytest.mark.parametrize(("other", "added"), [(19_500.0, True), (17_000.0, False)])
 def test_a_third_of_what_is_left_is_enough_where_no_other_kind_comes_near(other, added):
     start, base, better = model([], 1e6), model([A], 20_000.0), model([A, C], 13_500.0)
-    rival = model([A, Unit("delay", "x")], other)
-    assert _identified(start, base, better, [better, rival]) == added
+    rival = model([A, Unit("delay", "x")], other, flipped=True)
+    assert identified(start, base, better, [better, rival]) == added
+
+
+@pytest.mark.parametrize(("left", "added"), [(450.0, True), (1600.0, False)])
+def test_what_is_hardly_a_share_of_the_gap_is_named_if_one_effect_takes_all_of_it(left, added):
+    """Less than a hundredth, but five times the noise."""
+    start, base, better = model([], 1e6), model([A], 2400.0), model([A, C], left)
+    assert identified(start, base, better, [better]) == added

@@ -26,13 +26,18 @@ def candidates(
     """Return what the data say about every unit."""
     seen = selection.screens[0]
     dispersion = max(1.0, float((selection.nominal.fit.innovations**2).mean()))
-    strongest, detectable = seen.best(1.0), seen.detectable(alpha)
-    fitted = {m.units[0]: m for m in selection.tried if len(m.units) == 1}
     used = set(selection.best.units)
+    # what got another frequency in a later round is the same unit of the first
+    later = {str(unit): unit for unit in used - set(seen.units)}
+    same = {unit: later.get(str(unit), unit) for unit in seen.units}
+    strongest = {same[unit]: value for unit, value in seen.best(1.0).items()}
+    detectable = {same[unit]: value for unit, value in seen.detectable(alpha).items()}
+    fitted = {m.units[0]: m for m in selection.tried if len(m.units) == 1}
     excess = max(seen.residual - seen.effective, 1e-9)
-    growth = dict(zip(seen.units, (seen.growth**2).tolist(), strict=True))
+    units = [same[unit] for unit in seen.units]
+    growth = dict(zip(units, (seen.growth**2).tolist(), strict=True))
     swallowed: dict[Unit, float] = {}
-    for unit, share in zip(seen.units, seen.swallowed.tolist(), strict=True):
+    for unit, share in zip(units, seen.swallowed.tolist(), strict=True):
         swallowed[unit] = max(swallowed.get(unit, 0.0), share)
     result = []
     likely = sorted(strongest, key=lambda unit: (unit not in used, unit not in fitted))

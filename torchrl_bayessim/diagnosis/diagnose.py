@@ -6,6 +6,7 @@ __all__ = ["diagnose"]
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -29,13 +30,13 @@ from .chance import chances, detectable, of_chance, unseen
 from .holds import bridged
 from .losses import losses
 from .modes import MODES
-from .objective import Unit, pushes_of, units_of
+from .objective import Point, Unit, pushes_of, units_of
 from .onsets import with_onsets
 from .preparation import Prepared, prepare
 from .report import Report
 from .scatter import Scatter, gap_with_holds
 from .selection import select
-from .shapes import SHAPED, shaped
+from .shapes import SHAPED, shaped, with_shapes
 
 _ALPHA = 0.01
 _JITTER = 0.05  # of the control step; times since 1970 are rounded
@@ -101,14 +102,15 @@ def diagnose(
         progress("fitting the parameters")
         bridges, holds = bridged(logs, system.robot) if _asks_for_holds(every) else (logs, [])
         prepared = prepare(system, bridges, units, generator=generator, mode=told, horizon=horizon)
-        if prepared.mode.synchronised:
-            units = _with_shapes(system, prepared, units)
+        shapes = partial(_shapes, system, prepared, units)
+        units = with_shapes(units, shapes(prepared.nominal.point))
         units = with_onsets(prepared.sets["train"], prepared.nominal.point, units)
         selection = select(
             prepared.sets["train"],
             prepared.sets["validation"],
             prepared.nominal,
             units,
+            shapes=shapes,
             alpha=_ALPHA,
             generator=generator,
             progress=progress,
@@ -177,21 +179,19 @@ def _asks_for_holds(units: Sequence[Unit]) -> bool:
     return any(unit.name == SensorDropout.name for unit in units)
 
 
-def _with_shapes(system: System, prepared: Prepared, units: list[Unit]) -> list[Unit]:
-    """Return the units, with frequencies, phases and steps that the data suggest."""
+def _shapes(system: System, prepared: Prepared, units: Sequence[Unit], point: Point) -> list[Unit]:
+    """Return those of the units whose frequencies, phases and steps the data suggest at a point."""
     names = {unit.name for unit in units} & set(SHAPED)
-    if not names:
-        return units
+    if not names or not prepared.mode.synchronised:
+        return []
     found = shaped(
         prepared.predictor,
         prepared.logs["train"],
-        z=prepared.nominal.point.z,
+        point=point,
         noise=prepared.noise,
         pushes=pushes_of(system.robot),
     )
-    found = [unit for unit in found if unit.name in names]
-    better = {(unit.name, unit.where) for unit in found}
-    return [u for u in units if (u.name, u.where) not in better] + found
+    return [unit for unit in found if unit.name in names]
 
 
 def _system(simulator: str | Task | System, prior: BoxPrior | None) -> System:

@@ -18,17 +18,13 @@ import numpy as np
 
 from .alternatives import alternatives, exchanged
 from .explanations import bent, compare, explanations
+from .further_effects import identified, nothing_left
 from .model import Model, as_good, criterion, gain, judged, needed
 from .objective import Objective, Point, Unit
 from .refit import Fit, refit
 from .screening import Screen
+from .shapes import with_shapes
 
-_SHARE = 0.1  # of the gap: what an effect that could be another must remove to be kept
-_REST = 0.5  # of what the base leaves: what any further effect must remove
-_LONE, _ALONE = 0.25, 4.0  # the same where it removes so many times what any other kind does
-_REMAINS = 0.01  # of the gap: not worth another effect
-_WRONG = 1.5  # mean squared innovation of a base that something is missing from
-_SURELY, _NOTHING = 50.0, 0.2  # gain, and share of what the base leaves: it was just this
 _MOST = 4  # effects in one explanation
 _UNSEEN = 1.0  # a deviance that no test can detect
 _EXCHANGES = 3  # of effects for others in their places
@@ -63,6 +59,7 @@ def select(
     nominal: Fit,
     units: Sequence[Unit],
     *,
+    shapes: Callable[[Point], Sequence[Unit]] = lambda _: (),
     alpha: float = 0.01,
     generator: np.random.Generator,
     progress: Callable[[str], None] = lambda _: None,
@@ -74,6 +71,8 @@ def select(
         validation: Where they are judged.
         nominal: The fit of the parameters alone.
         units: The effects to consider, at each of their targets.
+        shapes: Returns those among them that have a frequency or a step, as they are seen beside
+            what is in the model already.
         alpha: Level of the test that anything is missing, in every round.
         generator: Of the null distribution's draws.
         progress: Told what is done.
@@ -82,8 +81,10 @@ def select(
     best, tried, screens, p_values = start, [start], [], []
     for round_number in range(_MOST):
         progress(f"screening {len(units)} effects, round {round_number + 1}")
+        enough = nothing_left(start, best)
         left = [u for u in units if u not in best.units]
-        enough = _all_explained(start, best)
+        if best.units and not enough:
+            left = with_shapes(left, _beside(best, shapes(best.fit.point)))
         now = compare(train, best.fit, left, glance=enough)
         screens.append(now.seen)
         p_values.append(_p_value(now.seen, best, generator))
@@ -94,7 +95,7 @@ def select(
         models = judged(train, validation, explanations(train, now))
         tried += models
         better = _needed_only(start, best, _chosen(best, models), models)
-        if better is None or not _identified(start, best, better, models):
+        if better is None or not identified(start, best, better, models):
             break
         best = _exactly(train, validation, better)
     best, others = _settled(
@@ -131,13 +132,10 @@ def _settled(
     return best, {}
 
 
-def _all_explained(start: Model, best: Model) -> bool:
-    """Return whether too little of the gap is left to be a cause of its own.
-
-    The true law in a simulator that integrates differently leaves as much.
-    """
-    alone, left = (float((m.fit.innovations**2).mean()) - 1.0 for m in (start, best))
-    return bool(best.units) and left < _REMAINS * alone
+def _beside(model: Model, found: Sequence[Unit]) -> list[Unit]:
+    """Return those that the model does not have at their places already."""
+    there = {(unit.name, unit.where) for unit in model.units}
+    return [unit for unit in found if (unit.name, unit.where) not in there]
 
 
 def _exactly(train: Objective, validation: Objective, model: Model) -> Model:
@@ -209,47 +207,9 @@ def _needed_only(
         return better
     single = [m for m in models if len({u.name for u in m.units if u not in base.units}) == 1]
     smaller = _chosen(base, single)
-    if smaller is None or _identified(start, smaller, better, models):
+    if smaller is None or identified(start, smaller, better, models):
         return better
     return smaller
-
-
-def _identified(start: Model, base: Model, better: Model, models: Sequence[Model]) -> bool:
-    """Return whether what is added to a base with effects is more than a stopgap.
-
-    A model that is right but for the form of a law leaves a little that many effects can mend. An
-    effect is added only if it matters: to the gap, or, if nothing else could mend it as well, to
-    what the base leaves.
-    """
-    if not base.units:
-        return True
-    if _all_explained(start, base):
-        return False
-    alone, before, after = (_mean_square(m) for m in (start, base, better))
-    if before - after > _SHARE * (alone - 1.0):
-        return True
-    added = _added(base, better)
-    others = [m for m in models if not _added(base, m) & added]
-    next_best = before - min([before, *(_mean_square(m) for m in others)])
-    lone = before - after > _ALONE * next_best
-    if before - after < (_LONE if lone else _REST) * (before - 1.0):
-        return False
-    rivals = [_added(base, m) for m in models if m is not better and as_good(better, m)]
-    just_this = gain(base, better) > _SURELY and after - 1.0 < _NOTHING * (before - 1.0)
-    # what has the same beside something else says nothing against it
-    alike = all(groups <= added or added <= groups for groups in rivals)
-    return (before > _WRONG or just_this) and alike
-
-
-def _mean_square(model: Model) -> float:
-    """Return the mean squared innovation of training and validation."""
-    parts = model.fit.innovations.ravel(), model.validation.ravel()
-    return float((np.concatenate(parts) ** 2).mean())
-
-
-def _added(base: Model, model: Model) -> set[str]:
-    """Return the kinds of what a model has beside those of its base."""
-    return {unit.effect.group for unit in model.units if unit not in base.units}
 
 
 def _eliminated(train: Objective, validation: Objective, model: Model) -> tuple[Model, list[Model]]:

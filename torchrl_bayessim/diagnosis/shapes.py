@@ -10,7 +10,7 @@ common.
 
 from __future__ import annotations
 
-__all__ = ["SHAPED", "shaped"]
+__all__ = ["SHAPED", "shaped", "with_shapes"]
 
 import math
 from collections.abc import Sequence
@@ -34,6 +34,7 @@ from .whitening import whitening
 Array = NDArray[np.float64]
 SHAPED = (PeriodicDisturbance.name, Cogging.name, ActionQuantization.name)
 _STEPS = 6  # control steps over which a force is taken to be constant
+_BEFORE = 8  # control steps that effects remember
 _MOST = 400  # segments
 _SLOWEST = 0.5  # cycles per log: slower ones are trends
 _NUMBERS = np.arange(2.0, 25.0)  # cogs per turn; one is gravity's
@@ -42,14 +43,14 @@ _FINEST, _GRID = 0.02, 600  # of the largest step that is plausible; steps tried
 
 
 def shaped(
-    predictor: Predictor, logs: Sequence[Log], *, z: Array, noise: Array, pushes: Sequence[Unit]
+    predictor: Predictor, logs: Sequence[Log], *, point: Point, noise: Array, pushes: Sequence[Unit]
 ) -> list[Unit]:
     """Return periodic disturbances, cogging, and rounded commands, where they stand out.
 
     Args:
         predictor: Simulates.
         logs: The training logs.
-        z: Where the parameters were fitted.
+        point: What is in the model already.
         noise: Standard deviation of each channel's noise.
         pushes: A constant force at each joint.
     """
@@ -57,10 +58,10 @@ def shaped(
     if not pushes or shortest <= 2 * _STEPS:
         return []
     system = predictor.system
-    pieces = cut(logs, _STEPS, history=1, most=_MOST)
-    white = whitening(predictor, pieces, parameters_at(system.prior, z), noise)
+    pieces = cut(logs, _STEPS, history=_BEFORE if point.strengths else 1, most=_MOST)
+    white = whitening(predictor, pieces, parameters_at(system.prior, point.z), noise)
     objective = Objective(predictor, system.prior, pieces, white)
-    force = missing_force(objective, Point(z), pushes)
+    force = missing_force(objective, point, pushes)
     middle = pieces.history + _STEPS // 2
     time, spacing = pieces.time[:, middle], _STEPS * system.control_dt
     span = float(np.mean([len(log) for log in logs])) * system.control_dt
@@ -90,6 +91,12 @@ def shaped(
         if step is not None:  # the screen's higher level is the step itself
             units.append(replace(unit, high=step / LEVELS[-1]))
     return units
+
+
+def with_shapes(units: Sequence[Unit], found: Sequence[Unit]) -> list[Unit]:
+    """Return the units, with those that were found in the place of their like."""
+    better = {(unit.name, unit.where) for unit in found}
+    return [u for u in units if (u.name, u.where) not in better] + [*found]
 
 
 def _waves(positions: Array) -> Array:

@@ -1,0 +1,100 @@
+"""Whether a further effect is more than a stopgap for the wrong form of another.
+
+A model that is right but for the form of a law leaves a little that many effects can mend. So a
+further effect has to matter: to the gap, or to what the others leave, and then no effect of another
+kind may do the same by other means. What does the same by the same means is the same explanation
+under another name, and stands beside it as its rival.
+"""
+
+from __future__ import annotations
+
+__all__ = ["identified", "nothing_left"]
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .model import Model, as_good, gain
+
+_SHARE = 0.1  # of the gap: what an effect that could be another must remove to be kept
+_REST = 0.5  # of what the base leaves: what any further effect must remove
+_LONE, _ALONE = 0.25, 4.0  # the same where it removes so many times what any other kind does
+_REMAINS = 0.01  # of the gap: not worth another effect
+_VISIBLE = 1.2  # mean squared innovation that shows however small a share of the gap
+_WRONG = 1.5  # mean squared innovation of a base that something is missing from
+_SURELY, _NOTHING = 50.0, 0.2  # gain, and share of what the base leaves: it was just this
+_DIFFERENT = 0.1  # of the change that an effect makes: what another makes differently
+
+
+def identified(start: Model, base: Model, better: Model, models: Sequence[Model]) -> bool:
+    """Return whether what is added to a base with effects is more than a stopgap.
+
+    Args:
+        start: Parameters alone.
+        base: With the effects that there are already.
+        better: With further ones.
+        models: All that were tried on the base.
+    """
+    if not base.units:
+        return True
+    if nothing_left(start, base):
+        return False
+    alone, before, after = (_mean_square(m) for m in (start, base, better))
+    if before - after > _SHARE * (alone - 1.0):
+        return True
+    removed = (before - after) / max(before - 1.0, 1e-9)
+    added = _added(base, better)
+    others = [m for m in models if not (_added(base, m) & added or _same(base, better, m))]
+    next_best = before - min([before, *(_mean_square(m) for m in others)])
+    lone = before - after > _ALONE * next_best
+    if removed < (_LONE if lone else _REST):
+        return False
+    just_this = gain(base, better) > _SURELY and removed > 1.0 - _NOTHING
+    second = len({unit.name for unit in base.units}) == 1 and lone and removed > _REST
+    if _all_explained(start, base) and not (just_this or second):
+        return False
+    return (before > _WRONG or just_this) and not _rivalled(base, better, models)
+
+
+def _rivalled(base: Model, better: Model, models: Sequence[Model]) -> bool:
+    """Return whether effects of other kinds, that do something else, mend the base as well.
+
+    What has the same beside something else says nothing against an effect.
+    """
+    added = _added(base, better)
+    others = [m for m in models if not (_added(base, m) <= added or added <= _added(base, m))]
+    return any(as_good(better, m) and not _same(base, better, m) for m in others)
+
+
+def _same(base: Model, better: Model, other: Model) -> bool:
+    """Return whether two explain the same part of what their base leaves: one under two names."""
+    mine, others, left = (
+        np.concatenate([m.fit.innovations.ravel(), m.validation.ravel()])
+        for m in (better, other, base)
+    )
+    return float(((others - mine) ** 2).sum()) < _DIFFERENT * float(((left - mine) ** 2).sum())
+
+
+def _added(base: Model, model: Model) -> set[str]:
+    """Return the kinds of what a model has beside those of its base."""
+    return {unit.effect.group for unit in model.units if unit not in base.units}
+
+
+def nothing_left(start: Model, best: Model) -> bool:
+    """Return whether what is left is neither a share of the gap nor above the noise."""
+    return _all_explained(start, best) and _mean_square(best) < _VISIBLE
+
+
+def _all_explained(start: Model, best: Model) -> bool:
+    """Return whether too little of the gap is left to be a cause of its own.
+
+    The true law in a simulator that integrates differently leaves as much.
+    """
+    alone, left = (float((m.fit.innovations**2).mean()) - 1.0 for m in (start, best))
+    return bool(best.units) and left < _REMAINS * alone
+
+
+def _mean_square(model: Model) -> float:
+    """Return the mean squared innovation of training and validation."""
+    parts = model.fit.innovations.ravel(), model.validation.ravel()
+    return float((np.concatenate(parts) ** 2).mean())
