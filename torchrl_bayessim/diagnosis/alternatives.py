@@ -62,12 +62,36 @@ def alternatives(
             if len(additions) < most:
                 additions.setdefault(unit.effect, {unit: strength})
         known += _fitted(train, validation, base, list(additions.values()), race=best.fit.cost)
+        known += _as_before((train, validation), best, name, tried)
         known += _sliding((train, validation), best, kept, units)
         known += _sticking((train, validation), best, name, units)
         if train.width > Objective.width:
             known += _nearer((train, validation), best, name, known)
         result[name] = tuple(known)
     return result
+
+
+def _as_before(
+    sets: tuple[Objective, Objective], best: Model, name: str, tried: Sequence[Model]
+) -> list[Model]:
+    """Return what was as good as an effect while that was alone, from its own parameters.
+
+    What needs other parameters, as a payload does, is not seen from the best's.
+    """
+    strengths = best.fit.point.strengths
+    mine = {unit for unit in strengths if unit.name == name}
+    kept = {unit: s for unit, s in strengths.items() if unit.name != name}
+    alone = [m for m in tried if set(m.units) == mine]
+    if not kept or not alone:
+        return []
+    names = {name, *(unit.name for unit in kept)}
+    starts = {
+        m.units: Point(m.fit.point.z, {**kept, **m.fit.point.strengths})
+        for m in tried
+        if len({unit.name for unit in m.units} - names) == 1 == len({unit.name for unit in m.units})
+        and as_good(alone[0], m)
+    }
+    return judged(*sets, refit(sets[0], list(starts.values()), race=best.fit.cost))
 
 
 def _sliding(
