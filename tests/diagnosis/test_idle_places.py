@@ -93,8 +93,18 @@ def test_a_third_of_what_is_left_is_enough_where_no_other_kind_comes_near(other,
     assert identified(start, base, better, [better, rival]) == added
 
 
-@pytest.mark.parametrize(("left", "added"), [(450.0, True), (1600.0, False)])
-def test_what_is_hardly_a_share_of_the_gap_is_named_if_one_effect_takes_all_of_it(left, added):
+@pytest.mark.parametrize(
+    ("first", "more", "left", "added"),
+    [
+        ([A], C, 450.0, True),
+        ([A], C, 1600.0, False),
+        ([A], Unit("timing", "hip"), 450.0, False),  # as another integrator does
+        ([A, C], Unit("drag", "hip"), 450.0, False),
+    ],
+)
+def test_what_is_hardly_a_share_of_the_gap_is_named_if_one_effect_takes_all_of_it(
+    first, more, left, added
+):
     """Less than a hundredth, but five times the noise."""
-    start, base, better = model([], 1e6), model([A], 2400.0), model([A, C], left)
+    start, base, better = model([], 1e6), model(first, 2400.0), model([*first, more], left)
     assert identified(start, base, better, [better]) == added

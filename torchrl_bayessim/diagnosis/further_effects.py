@@ -14,6 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..effects.action import ActionDelay
 from .model import Model, as_good, gain
 
 _SHARE = 0.1  # of the gap: what an effect that could be another must remove to be kept
@@ -50,9 +51,11 @@ def identified(start: Model, base: Model, better: Model, models: Sequence[Model]
     if removed < (_LONE if lone else _REST):
         return False
     just_this = gain(base, better) > _SURELY and removed > 1.0 - _NOTHING
-    second = len({unit.name for unit in base.units}) == 1 and lone and removed > _REST
-    if _all_explained(start, base) and not (just_this or second):
-        return False
+    if _all_explained(start, base):
+        # a simulator that integrates otherwise is late, too, by a part of its time step
+        second = len({unit.name for unit in base.units}) == 1 and ActionDelay.group not in added
+        if not second or not (just_this or (lone and removed > _REST)):
+            return False
     return (before > _WRONG or just_this) and not _rivalled(base, better, models)
 
 
