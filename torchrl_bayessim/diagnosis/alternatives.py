@@ -8,7 +8,7 @@ from __future__ import annotations
 
 __all__ = ["alternatives", "exchanged", "kind"]
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -61,7 +61,7 @@ def alternatives(
         for unit, (_, strength) in strongest.items():
             if len(additions) < most:
                 additions.setdefault(unit.effect, {unit: strength})
-        known += _fitted(train, validation, base, list(additions.values()), race=best.fit.cost)
+        known += _raced((train, validation), _with_each(base, additions.values()), best)
         known += _as_before((train, validation), best, name, tried)
         known += _sliding((train, validation), best, kept, units)
         known += _sticking((train, validation), best, name, units)
@@ -84,14 +84,18 @@ def _as_before(
     alone = [m for m in tried if set(m.units) == mine]
     if not kept or not alone:
         return []
-    names = {name, *(unit.name for unit in kept)}
+    names = _names(best)
+    others = [m for m in tried if len(_names(m)) == 1 and not _names(m) & names]
     starts = {
         m.units: Point(m.fit.point.z, {**kept, **m.fit.point.strengths})
-        for m in tried
-        if len({unit.name for unit in m.units} - names) == 1 == len({unit.name for unit in m.units})
-        and as_good(alone[0], m)
+        for m in others
+        if as_good(alone[0], m)
     }
-    return judged(*sets, refit(sets[0], list(starts.values()), race=best.fit.cost))
+    return _raced(sets, list(starts.values()), best)
+
+
+def _names(model: Model) -> set[str]:
+    return {unit.name for unit in model.units}
 
 
 def _sliding(
@@ -148,7 +152,7 @@ def _nearer(
             for times in (1.0, 2.0):
                 more = {u: u.inside(times * strengths[u]) for u in added}
                 starts.append(Point(best.fit.point.z, {**strengths, **more}))
-    return judged(*sets, refit(sets[0], starts, race=best.fit.cost)) if starts else []
+    return _raced(sets, starts, best)
 
 
 def kind(effect: Effect) -> str:
@@ -162,17 +166,15 @@ def _stands_in(model: Model, kept: dict[Unit, float], name: str) -> bool:
     return set(kept) <= set(model.units) and len(others) == 1 and others != {name}
 
 
-def _fitted(
-    train: Objective,
-    validation: Objective,
-    base: Model,
-    additions: Sequence[dict[Unit, float]],
-    *,
-    race: float,
-) -> list[Model]:
-    """Fit the base model with each addition that can come near a cost."""
-    starts = [Point(base.fit.point.z, {**base.fit.point.strengths, **more}) for more in additions]
-    return judged(train, validation, refit(train, starts, race=race)) if starts else []
+def _with_each(base: Model, additions: Iterable[Mapping[Unit, float]]) -> list[Point]:
+    """Return the base with each addition."""
+    point = base.fit.point
+    return [Point(point.z, {**point.strengths, **more}) for more in additions]
+
+
+def _raced(sets: tuple[Objective, Objective], starts: Sequence[Point], best: Model) -> list[Model]:
+    """Fit what can come near the best model's cost."""
+    return judged(*sets, refit(sets[0], starts, race=best.fit.cost)) if starts else []
 
 
 def exchanged(best: Model, others: Mapping[str, Sequence[Model]]) -> Model:

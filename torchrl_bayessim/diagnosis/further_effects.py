@@ -40,13 +40,13 @@ def identified(start: Model, base: Model, better: Model, models: Sequence[Model]
         return True
     if nothing_left(start, base):
         return False
-    alone, before, after = (_mean_square(m) for m in (start, base, better))
+    alone, before, after = (m.mean_square for m in (start, base, better))
     if before - after > _SHARE * (alone - 1.0):
         return True
     removed = (before - after) / max(before - 1.0, 1e-9)
     added = _added(base, better)
     others = [m for m in models if not (_added(base, m) & added or _same(base, better, m))]
-    next_best = before - min([before, *(_mean_square(m) for m in others)])
+    next_best = before - min([before, *(m.mean_square for m in others)])
     lone = before - after > _ALONE * next_best
     if removed < (_LONE if lone else _REST):
         return False
@@ -85,7 +85,7 @@ def _added(base: Model, model: Model) -> set[str]:
 
 def nothing_left(start: Model, best: Model) -> bool:
     """Return whether what is left is neither a share of the gap nor above the noise."""
-    return _all_explained(start, best) and _mean_square(best) < _VISIBLE
+    return _all_explained(start, best) and best.mean_square < _VISIBLE
 
 
 def _all_explained(start: Model, best: Model) -> bool:
@@ -95,9 +95,3 @@ def _all_explained(start: Model, best: Model) -> bool:
     """
     alone, left = (float((m.fit.innovations**2).mean()) - 1.0 for m in (start, best))
     return bool(best.units) and left < _REMAINS * alone
-
-
-def _mean_square(model: Model) -> float:
-    """Return the mean squared innovation of training and validation."""
-    parts = model.fit.innovations.ravel(), model.validation.ravel()
-    return float((np.concatenate(parts) ** 2).mean())

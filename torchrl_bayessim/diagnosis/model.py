@@ -44,6 +44,11 @@ class Model:
         """Return misfits of all segments, training then validation."""
         return np.concatenate([(self.fit.innovations**2).sum(-1), (self.validation**2).sum(-1)])
 
+    @property
+    def mean_square(self) -> float:
+        """The mean squared innovation of training and validation."""
+        return float(self.deviances().sum()) / (self.fit.innovations.size + self.validation.size)
+
     def dispersion(self) -> float:
         """Return the variance of what is left of the validation innovations, at least 1."""
         return max(1.0, float(np.mean(self.validation**2)))
@@ -83,7 +88,7 @@ def as_good(best: Model, rival: Model) -> bool:
     mine, others = best.deviances(), rival.deviances()
     if float((others - mine).sum()) / best.dispersion() < LIKELY:
         return True
-    if float(mine.sum()) / (best.fit.innovations.size + best.validation.size) < _WHITE:
+    if best.mean_square < _WHITE:
         return False
     if float(others.sum()) > _WORSE * float(mine.sum()):
         return False

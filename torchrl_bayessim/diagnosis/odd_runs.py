@@ -10,7 +10,7 @@ import numpy as np
 
 from ..logs.log import Log
 from .objective import Objective, Point
-from .shrinkage import squares
+from .shrinkage import squares, summed
 
 _ODD = 4.0  # times the error of a usual run, and times the noise
 _USUAL = 2.0  # noise floors of a usual run: of more, all runs depart
@@ -32,7 +32,7 @@ def odd_runs(
     means = {}
     for name, objective in sets.items():
         groups = objective.segments.log
-        sums, sizes = squares(objective, [point], groups)
+        sums, sizes = summed(squares(objective, [point]), groups)
         for i, each, size in zip(np.unique(groups), sums, sizes, strict=True):
             means[logs[name][i].name] = float(each / size)
     if len(means) < 3:

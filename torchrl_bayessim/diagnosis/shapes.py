@@ -55,10 +55,11 @@ def shaped(
         pushes: A constant force at each joint.
     """
     shortest = min(len(log) for log in logs)
-    if not pushes or shortest <= 2 * _STEPS:
+    history = _BEFORE if point.strengths else 1
+    if not pushes or shortest <= max(2 * _STEPS, history + _STEPS):
         return []
     system = predictor.system
-    pieces = cut(logs, _STEPS, history=_BEFORE if point.strengths else 1, most=_MOST)
+    pieces = cut(logs, _STEPS, history=history, most=_MOST)
     white = whitening(predictor, pieces, parameters_at(system.prior, point.z), noise)
     objective = Objective(predictor, system.prior, pieces, white)
     force = missing_force(objective, point, pushes)

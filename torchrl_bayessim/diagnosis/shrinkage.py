@@ -7,7 +7,7 @@ the parameters alone gains is the parameters' credit.
 
 from __future__ import annotations
 
-__all__ = ["Shrinkage", "shrinkage", "squares"]
+__all__ = ["Shrinkage", "shrinkage", "squares", "summed"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -108,16 +108,15 @@ def shrinkage(
             for more than there is. All figures are in units of it.
         beside: Segments of the validation runs.
     """
-    each = squares(test, points, np.arange(len(test.segments)))
-    own = _grouped(test, each, floor)
+    each = squares(test, points)
+    own = _resampling(test, each, floor)
     raw, refit, effects = (float(s.sum() / own[3].sum()) for s in own[:3])
     # noise may leave less than its mean; more than all cannot be explained
     explained = min((refit - effects) / (refit - 1.0), 1.0) if refit > 1.0 else 0.0
     _, refits, after = _resampled(own, generator)
     wider = own
     if beside is not None:
-        others = squares(beside, points, np.arange(len(beside.segments)))
-        wider = np.concatenate([own, _grouped(beside, others, floor)], 1)
+        wider = np.concatenate([own, _resampling(beside, squares(beside, points), floor)], 1)
     _, before, left = _resampled(wider, generator)
     least = np.minimum(left, 1.0) * (1.0 + _FLOOR_ERROR * generator.standard_normal(len(left)))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -130,11 +129,11 @@ def shrinkage(
     )  # fmt: skip
 
 
-def _grouped(objective: Objective, each: Array, floor: float) -> Array:
+def _resampling(objective: Objective, each: Array, floor: float) -> Array:
     """Return squares of the three points and their number, summed over units to resample."""
-    groups, index = np.unique(objective.segments.log, return_inverse=True)
-    if len(groups) >= _LOGS:
-        each = np.array([np.bincount(index, one, len(groups)) for one in each], dtype=np.float64)
+    groups = objective.segments.log
+    if len(np.unique(groups)) >= _LOGS:
+        each = summed(each, groups)
     return each * np.array([1.0, 1.0, 1.0, floor])[:, None]
 
 
@@ -150,22 +149,30 @@ def _better(gains: Array) -> float:
     return float(stats.ttest_1samp(gains, 0.0, alternative="greater").pvalue)
 
 
-def squares(objective: Objective, points: Sequence[Point], groups: NDArray[np.int64]) -> Array:
-    """Return sums of squared innovations, and of how many they count as, over groups of segments.
+def squares(objective: Objective, points: Sequence[Point]) -> Array:
+    """Return squared innovations of each segment, and of how many they count as.
 
     Args:
         objective: Of the segments.
         points: ``P`` of them.
-        groups: Of each segment, shape ``(S,)``.
 
     Returns:
-        Shape ``(P + 1, G)``: one row per point and the number, groups in ascending order.
+        Shape ``(P + 1, S)``: one row per point, and the number.
     """
     innovations = objective(points)
     size = objective.whitening.weights**2 * innovations.shape[2]
+    return np.array([*(innovations**2).sum(-1), size], dtype=np.float64)
+
+
+def summed(each: Array, groups: NDArray[np.int64]) -> Array:
+    """Return rows summed over groups of segments, ``(…, G)``, in ascending order of the group.
+
+    Example:
+        >>> summed(np.array([[1.0, 2.0, 4.0]]), np.array([7, 3, 7]))
+        array([[2., 5.]])
+    """
     names, index = np.unique(groups, return_inverse=True)
-    per = (*(innovations**2).sum(-1), size)
-    return np.array([np.bincount(index, one, len(names)) for one in per], dtype=np.float64)
+    return np.array([np.bincount(index, row, len(names)) for row in each], dtype=np.float64)
 
 
 def _resampled(sums: Array, generator: np.random.Generator) -> Array:
