@@ -141,7 +141,9 @@ def test_a_further_cause_has_rivals_of_its_own():
     )  # fmt: skip
     report = diagnose(system(), None, data, effects=effects)
     first, second = report.effects
-    assert (first.name, second.name) == ("action_bias", "coulomb_friction")
+    # of twins the last digits of a processor say which comes first
+    assert {first.name, *first.rivals} >= {"action_bias", "constant_force"}
+    assert second.name == "coulomb_friction"
     assert report.confusion_set == (first.name, *first.rivals)
     assert "directional_friction" in second.rivals
     assert f"place of coulomb friction it may be: {', '.join(second.rivals)}." in str(report)

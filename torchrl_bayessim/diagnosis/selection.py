@@ -21,6 +21,7 @@ from .explanations import bent, compare, explanations
 from .further_effects import identified, nothing_left
 from .model import Model, as_good, criterion, gain, judged, needed
 from .objective import Objective, Point, Unit
+from .phase_fit import with_fitted_phases
 from .refit import Fit, refit
 from .screening import Screen
 from .shapes import with_shapes
@@ -97,7 +98,10 @@ def select(
         better = _needed_only(start, best, _chosen(best, models), models)
         if better is None or not identified(start, best, better, models):
             break
-        best = _exactly(train, validation, better)
+        best = with_fitted_phases(train, validation, _exactly(train, validation, better))
+        new = [unit for unit in best.units if unit not in better.units]
+        units = with_shapes(units, new)  # in the places of what was read off a grid
+        tried += [best] if new else []
     best, others = _settled(
         train, validation, best, units=units, tried=tried, first=screens[0], progress=progress
     )
