@@ -146,7 +146,10 @@ def test_a_further_cause_has_rivals_of_its_own():
     assert second.name == "coulomb_friction"
     assert report.confusion_set == (first.name, *first.rivals)
     assert "directional_friction" in second.rivals
-    assert f"place of coulomb friction it may be: {', '.join(second.rivals)}." in str(report)
+    rivals = ", ".join(second.rivals).replace("_", " ")
+    assert f"place of coulomb friction it may be: {rivals}." in str(report)
+    assert "coulomb friction at hinge" in str(report)
+    assert ", together explain over 99 %" in str(report)
 
 
 def test_nothing_is_ruled_out_while_something_is_missing():

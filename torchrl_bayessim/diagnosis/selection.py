@@ -30,6 +30,7 @@ _MOST = 4  # effects in one explanation
 _UNSEEN = 1.0  # a deviance that no test can detect
 _EXCHANGES = 3  # of effects for others in their places
 _IDLE = 1e-3  # of the deviance that an effect explains at another place
+_EQUAL = 0.1  # of the deviance
 _APART = 3  # effects without each of which a model is fitted with derivatives of its own
 
 
@@ -181,7 +182,10 @@ def _chosen(base: Model, models: Sequence[Model]) -> Model | None:
     better = [m for m in models if gain(base, m) > needed(base, m)]
     if not better:
         return None
-    first = min(better, key=lambda m: criterion(m, dispersion))
+    least = min(criterion(m, dispersion) for m in better)
+    # of twins, such as a bias of commands and a constant force, not the one that rounding prefers
+    equal = [m for m in better if criterion(m, dispersion) < least + _EQUAL]
+    first = min(equal, key=lambda m: [str(unit) for unit in m.units])
     return min([first, *_coarser(first, better)], key=lambda m: len(m.units))
 
 

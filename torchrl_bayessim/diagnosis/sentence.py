@@ -61,30 +61,31 @@ def sentence(
     causes = ", and ".join(_described(e) for e in effects)
     low, high = measured.elsewhere
     least, most = (f"{100 * max(end, 0.0):.0f}" for end in (low, high))
-    share = f"explains {_percent(measured.explained)} [{least}, {most}] of it"
+    verb = "explains" if len(effects) == 1 else "together explain"
+    share = f"{verb} {_percent(measured.explained)} [{least}, {most}] of it"
     if validated is not None:
-        share = f"explains {_percent(validated)} of it on validation runs, test runs hardly show it"
+        share = f"{verb} {_percent(validated)} of it on validation runs, test runs hardly show it"
     elif measured.refit <= NEGLIGIBLE:
         share = "found on other runs, too small to matter on test runs"
     others = _rivals_of_others(effects, confused)
     if verdict == "ambiguous":
-        equals = ", ".join(confused)
+        equals = ", ".join(map(_spaced, confused))
         return (
             f"{gap} These data cannot tell the causes apart: {equals}. The first, {causes}, "
             f"{share}.{others}{parameters}{untested}"
         )
-    text = f"{gap} Cause: {causes}, {share}"
+    text = f"{gap} {'Cause' if len(effects) == 1 else 'Causes'}: {causes}, {share}"
     partial = verdict != "named" and validated is None and measured.refit > NEGLIGIBLE
     text += f"; {_percent(1 - measured.explained)} remain." if partial else "."
     if len(confused) > 1:
-        text += f" Not separable from: {', '.join(confused[1:])}."
+        text += f" Not separable from: {', '.join(map(_spaced, confused[1:]))}."
     return f"{text}{others}{parameters}{untested}"
 
 
 def _rivals_of_others(effects: Sequence[Finding], confused: Sequence[str]) -> str:
     """Return what may stand in the place of effects beside the first."""
     return "".join(
-        f" In the place of {e.name.replace('_', ' ')} it may be: {', '.join(e.rivals)}."
+        f" In the place of {_spaced(e.name)} it may be: {', '.join(map(_spaced, e.rivals))}."
         for e in effects
         if e.rivals and e.name not in confused[:1]
     )
@@ -162,9 +163,13 @@ def _percent(share: float) -> str:
     return "over 99 %" if text == "100 %" and share < 1.0 else text
 
 
+def _spaced(name: str) -> str:
+    return name.replace("_", " ")
+
+
 def _described(effect: Finding) -> str:
     half = (effect.ci95[1] - effect.ci95[0]) / 2
-    name = effect.name.replace("_", " ")
+    name = _spaced(effect.name)
     law = "".join(text.format(effect.form[k]) for k, text in _FORMS.items() if k in effect.form)
     if len(effect.strengths) > 1:
         least, most = (pick(effect.strengths.values()) for pick in (min, max))
@@ -182,7 +187,7 @@ def _ruled_out(candidates: Sequence[Candidate]) -> str:
     found: dict[str, str] = {}
     for c in candidates:
         if c.status == "ruled_out" and c.minimal_detectable_strength is not None:
-            name, least = c.name.replace("_", " "), c.minimal_detectable_strength
+            name, least = _spaced(c.name), c.minimal_detectable_strength
             text = f"{name} above {least:.2g} {c.unit} {_place(c)}"
             found.setdefault(c.name, text)
     some = list(found.values())[:4]
@@ -199,6 +204,6 @@ def _untested(candidates: Sequence[Candidate]) -> str:
     for c in candidates:
         by_name.setdefault(c.name, []).append(c.status)
     names = [name for name, seen in by_name.items() if set(seen) == {"not_excited"}]
-    shown = ", ".join(name.replace("_", " ") for name in names[:5])
+    shown = ", ".join(map(_spaced, names[:5]))
     more = f" and {len(names) - 5} more" if len(names) > 5 else ""
     return f" Could not be tested: {shown}{more}." if names else ""
