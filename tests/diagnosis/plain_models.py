@@ -1,0 +1,30 @@
+"""Models of numbers alone, with as much left in every segment, to be compared and chosen from."""
+
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import numpy as np
+
+from torchrl_bayessim.diagnosis.model import Model
+from torchrl_bayessim.diagnosis.objective import Point
+
+
+class Unit(NamedTuple):
+    name: str
+    where: str = "hip"
+
+    @property
+    def effect(self):
+        return SimpleNamespace(group=self.name)
+
+
+A, B, C = Unit("gain", "knee"), Unit("gain", "hip"), Unit("friction", "hip")
+
+
+def plain(units, deviance, *, z=0.0, segments=40, flipped=False):
+    """Return a model of units, or of strengths; the other side is left if ``flipped``."""
+    left = np.full((segments // 2, 10), np.sqrt(deviance / (10 * segments))) * (-1) ** flipped
+    strengths = dict(units) if isinstance(units, dict) else dict.fromkeys(units, 1.0)
+    point = Point(np.array([z]), strengths)
+    fit = SimpleNamespace(units=tuple(units), innovations=left, point=point, cost=deviance)
+    return Model(fit=fit, validation=left, logs=np.arange(segments))
