@@ -28,6 +28,7 @@ from ..physics.mujoco import MujocoPhysics
 from .assembly import assemble
 from .chance import chances, detectable, of_chance, unseen
 from .holds import bridged
+from .late_sensors import LATE, rides_free
 from .losses import losses
 from .modes import MODES
 from .objective import Point, Unit, pushes_of, units_of
@@ -39,6 +40,9 @@ from .selection import select
 from .shapes import SHAPED, shaped, with_shapes
 
 _ALPHA = 0.01
+_TOO_SHORT = (
+    "sensors that are late were left out: over {} control steps they show what was measured before"
+)
 _JITTER = 0.05  # of the control step; times since 1970 are rounded
 
 
@@ -105,16 +109,20 @@ def diagnose(
         shapes = partial(_shapes, system, prepared, units)
         units = with_shapes(units, shapes(prepared.nominal.point))
         units = with_onsets(prepared.sets["train"], prepared.nominal.point, units)
-        selection = select(
+        search = partial(
+            select,
             prepared.sets["train"],
             prepared.sets["validation"],
             prepared.nominal,
-            units,
             shapes=shapes,
             alpha=_ALPHA,
             generator=generator,
             progress=progress,
         )
+        selection = search(units)
+        if rides_free(prepared.sets["train"], prepared.noise, selection):
+            prepared = prepared.alarmed(_TOO_SHORT.format(prepared.horizon))
+            selection = search([unit for unit in units if unit.name not in LATE])
         random = of_chance(every)
         progress("looking for scatter")
         found = losses(prepared, selection, every) or chances(prepared.sets, selection, random)

@@ -73,6 +73,10 @@ class Prepared:
         """Names of the logs of each split."""
         return {name: tuple(log.name for log in part) for name, part in self.logs.items()}
 
+    def alarmed(self, alarm: str) -> Prepared:
+        """Return the same with one more thing that the reader must know."""
+        return replace(self, alarms=(*self.alarms, alarm))
+
 
 def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
     """Return training, validation and test logs.

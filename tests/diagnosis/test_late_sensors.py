@@ -1,0 +1,35 @@
+"""Late sensors show at first what was measured before a segment: that explains nothing."""
+
+import numpy as np
+import pytest
+from test_diagnose import logs, system
+
+from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.late_sensors import _no_more
+
+CHECKED = np.arange(6, 21, 2)
+GROWING = np.repeat((1.0 + CHECKED**2)[:, None], 2, axis=1)
+
+
+@pytest.mark.parametrize(
+    ("steps", "left", "free"),
+    [
+        ((4.0, 0.0), 1.0, False),  # only noise is left
+        ((4.0, 0.0), 1.0 + (CHECKED - 4.0) ** 2, True),  # as it was four steps before
+        ((14.0, 0.0), 0.1, True),  # most rows are no predictions
+        ((0.0, 0.0), 1.0, False),
+    ],
+)
+def test_an_error_as_large_as_it_was_so_many_steps_before_is_not_explained(steps, left, free):
+    after = GROWING.copy()
+    after[:, 0] = left
+    assert _no_more(GROWING, after, np.array(steps), CHECKED) == free
+
+
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_over_few_steps_no_gap_is_that_of_sensors_that_show_what_was_before(horizon):
+    damped = logs(push=lambda q, v: -1.5 * np.sin(9 * q) * v)
+    some = "sensor_delay", "sensor_lag", "sensor_bias"
+    report = diagnose(system(), None, damped, effects=some, horizon=horizon)
+    assert report.verdict == "unknown"
+    assert any("sensors that are late were left out" in alarm for alarm in report.alarms)
