@@ -25,7 +25,7 @@ from .found import Found
 from .location import location
 from .model import Model
 from .objective import Objective, Point, Unit
-from .odd_runs import odd_run_alarms, odd_runs
+from .odd_runs import odd_run_alarms, odd_runs, run_errors
 from .preparation import Prepared
 from .report import Candidate, Gap, Parameter, Report
 from .rollout import rollout_errors, worse_rollouts
@@ -76,7 +76,7 @@ def assemble(
     where, remainder = _locations(prepared, selection, credit, found.confused)
     rollouts = rollout_errors(prepared, points)
     units = _every_unit(selection, scatter)
-    odd = odd_runs(prepared.sets, prepared.logs, best.fit.point)
+    errors = run_errors(prepared.sets, prepared.logs, best.fit.point)
     verdict, summary, more = conclude(
         system,
         prepared,
@@ -88,7 +88,7 @@ def assemble(
         scattered=scatter.groups,
         where=where,
         diverges=diverges_throughout(rollouts),
-        odd=odd,
+        odd=odd_runs(errors),
         baseless=baseless(found.effects, units),
         doubts=doubts(found.effects, units, prepared),
         alpha=alpha,
@@ -104,7 +104,7 @@ def assemble(
         *prepared.alarms,
         *(str(f) for f in findings),
         *_absorbed(parameters),
-        *odd_run_alarms(odd),
+        *odd_run_alarms(errors),
         *divergence_alarms(prepared.sets["test"], told),
         *(worse_rollouts(rollouts) if names else ()),
         *more,
