@@ -22,6 +22,7 @@ from .doubts import baseless, doubts
 from .experiment import experiments
 from .figures import figures
 from .found import Found
+from .late_rows import late_row_alarms
 from .location import location
 from .model import Model
 from .objective import Objective, Point, Unit
@@ -93,6 +94,8 @@ def assemble(
         doubts=doubts(found.effects, units, prepared),
         alpha=alpha,
     )
+    if verdict == "unknown":
+        more += late_row_alarms(prepared.sets["train"], selection.nominal.fit)
     if verdict in {"none", "unknown", "not_testable"}:
         # what little was tried is among the candidates
         found = replace(found, effects=(), strengths={}, confused=())
