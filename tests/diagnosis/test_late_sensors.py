@@ -1,11 +1,15 @@
 """Late sensors show at first what was measured before a segment: that explains nothing."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from test_diagnose import logs, system
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
-from torchrl_bayessim.diagnosis.late_sensors import _no_more
+from torchrl_bayessim.diagnosis.late_sensors import _no_more, _steps
+from torchrl_bayessim.diagnosis.objective import Point, units_of
+from torchrl_bayessim.effects.sensors import SensorDelay, SensorLag
 
 CHECKED = np.arange(6, 21, 2)
 GROWING = np.repeat((1.0 + CHECKED**2)[:, None], 2, axis=1)
@@ -33,3 +37,20 @@ def test_over_few_steps_no_gap_is_that_of_sensors_that_show_what_was_before(hori
     report = diagnose(system(), None, damped, effects=some, horizon=horizon)
     assert report.verdict == "unknown"
     assert any("sensors that are late were left out" in alarm for alarm in report.alarms)
+
+
+def test_a_delay_of_every_channel_is_late_commands_and_a_filter_is_late_by_its_mean():
+    robot = system().robot
+    objective = SimpleNamespace(predictor=SimpleNamespace(system=SimpleNamespace(robot=robot)))
+    units = {str(u): u for u in units_of([SensorDelay(), SensorLag()], robot)}
+
+    def late(name, where, seconds):
+        point = Point(np.zeros(1), {units[f"{name}[{where}]"]: seconds})
+        return _steps(objective, [SimpleNamespace(fit=SimpleNamespace(point=point))])[0]
+
+    first, dt = robot.channels[0], robot.dt
+    assert late("sensor_delay", "all", 2 * dt).tolist() == [0.0, 0.0]
+    assert late("sensor_delay", first, 2 * dt) == pytest.approx([2.0, 0.0])
+    kept = np.exp(-1 / 3)
+    mean = sum(k * (1 - kept) * kept**k for k in range(200))
+    assert late("sensor_lag", first, 3 * dt) == pytest.approx([mean, 0.0])

@@ -60,7 +60,8 @@ def _steps(objective: Objective, models: list[Model]) -> list[Array]:
             if isinstance(effect, SensorDelay):
                 steps += values[0] / robot.dt
             elif isinstance(effect, SensorLag):
-                steps += 1 / np.expm1(robot.dt / np.maximum(values[0], 1e-9))
+                kept = np.exp(-robot.dt / np.maximum(values[0], 1e-9))
+                steps += kept / (1 - kept)
         result.append(steps)
     return result
 
