@@ -46,7 +46,7 @@ def test_a_delay_of_every_channel_is_late_commands_and_a_filter_is_late_by_its_m
 
     def late(name, where, seconds):
         point = Point(np.zeros(1), {units[f"{name}[{where}]"]: seconds})
-        return _steps(objective, [SimpleNamespace(fit=SimpleNamespace(point=point))])[0]
+        return _steps(objective, point)
 
     first, dt = robot.channels[0], robot.dt
     assert late("sensor_delay", "all", 2 * dt).tolist() == [0.0, 0.0]

@@ -9,13 +9,15 @@ steps that is all of it. (A delay of all channels alike is taken as one of all c
 
 from __future__ import annotations
 
-__all__ = ["LATE", "rides_free"]
+__all__ = ["LATE", "rides_free", "without_free_riders"]
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..effects.sensors import SensorDelay, SensorLag
-from .model import Model, as_good
+from .model import Model
 from .objective import Objective, Point, strengths_of
 from .selection import Selection
 from .strengths import with_late_commands
@@ -26,44 +28,45 @@ _PREDICTED = 0.5  # of the rows that are compared: how many at least are predict
 _MORE = 0.5  # of the error that it has for nothing: what it may leave
 
 
-def rides_free(objective: Objective, noise: Array, selection: Selection) -> bool:
-    """Return whether the best model, or one that is as good, is one of late sensors for nothing.
+def rides_free(objective: Objective, noise: Array, nominal: Model, model: Model) -> bool:
+    """Return whether a model has late sensors for nothing.
 
     Args:
         objective: Of the segments to look at.
         noise: Standard deviation of each channel's noise.
-        selection: What a search found.
+        nominal: Parameters alone.
+        model: With effects.
     """
-    rivals = [m for models in selection.alternatives.values() for m in models]
-    models = [selection.best, *(m for m in rivals if as_good(selection.best, m))]
-    late = [m for m in models if any(unit.name in LATE for unit in m.units)]
-    if not late or not objective.located:
+    if not objective.located or not any(unit.name in LATE for unit in model.units):
         return False
-    points = [selection.nominal.fit.point, *(m.fit.point for m in late)]
+    points = [nominal.fit.point, model.fit.point]
     errors = objective.raw(points) * objective.whitening.weights[:, None, None]
-    squares = np.nanmean((errors / noise) ** 2, axis=1)  # (P, K, C)
-    return any(
-        _no_more(squares[0], left, steps, objective.segments.checked)
-        for left, steps in zip(squares[1:], _steps(objective, late), strict=True)
-    )
+    before, after = np.nanmean((errors / noise) ** 2, axis=1)  # (K, C) each
+    return _no_more(before, after, _steps(objective, model.fit.point), objective.segments.checked)
 
 
-def _steps(objective: Objective, models: list[Model]) -> list[Array]:
-    """Return by how many control steps each channel is late in each model."""
+def without_free_riders(objective: Objective, noise: Array, selection: Selection) -> Selection:
+    """Return what was found, without rivals of late sensors that explain nothing."""
+    start = selection.nominal
+    others = {
+        name: tuple(m for m in models if not rides_free(objective, noise, start, m))
+        for name, models in selection.alternatives.items()
+    }
+    return replace(selection, alternatives=others)
+
+
+def _steps(objective: Objective, point: Point) -> Array:
+    """Return by how many control steps each channel is late."""
     robot = objective.predictor.system.robot
-    result = []
-    for model in models:
-        point = Point(model.fit.point.z, model.fit.point.strengths)
-        strengths = with_late_commands(strengths_of([point], robot), len(robot.actuators))
-        steps = np.zeros(len(robot.channels))
-        for effect, values in strengths.items():
-            if isinstance(effect, SensorDelay):
-                steps += values[0] / robot.dt
-            elif isinstance(effect, SensorLag):
-                kept = np.exp(-robot.dt / np.maximum(values[0], 1e-9))
-                steps += kept / (1 - kept)
-        result.append(steps)
-    return result
+    strengths = with_late_commands(strengths_of([point], robot), len(robot.actuators))
+    steps = np.zeros(len(robot.channels))
+    for effect, values in strengths.items():
+        if isinstance(effect, SensorDelay):
+            steps += values[0] / robot.dt
+        elif isinstance(effect, SensorLag):
+            kept = np.exp(-robot.dt / np.maximum(values[0], 1e-9))
+            steps += kept / (1 - kept)
+    return steps
 
 
 def _no_more(before: Array, after: Array, steps: Array, checked: NDArray[np.int64]) -> bool:
