@@ -12,7 +12,7 @@ from test_diagnose import ARM, BOUNDS, SOME, logs, system
 from torchrl_bayessim.diagnosis.credit import unit_credit
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.divergence import diverges_throughout
-from torchrl_bayessim.diagnosis.doubts import doubts
+from torchrl_bayessim.diagnosis.doubts import doubts, numerical
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.report import Finding
 from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
@@ -144,3 +144,31 @@ def test_places_of_one_effect_share_its_credit_by_what_each_changes():
     selection = SimpleNamespace(best=SimpleNamespace(fit=fit))
     credit = unit_credit(selection, {"coulomb_friction": 0.5})
     assert [credit[unit] for unit in units] == pytest.approx([0.1, 0.4])
+
+
+@pytest.mark.parametrize(
+    ("name", "strength", "damping", "artefact"),
+    [
+        ("armature", 0.004, 2.0, True),  # 2 ms times 2.4 N m s/rad, the servo's and the joint's
+        ("armature", 0.006, 2.0, False),
+        ("armature", 0.004, 0.0, False),
+        ("coulomb_friction", 0.004, 2.0, False),
+    ],
+)
+def test_an_armature_that_an_integrator_adds_is_no_cause(name, strength, damping, artefact):
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep="0.002"/><worldbody>
+      <body><joint name="a" damping="0.4"/><geom size=".1" mass="1"/></body></worldbody>
+      <actuator><position joint="a" kp="40" kv="{damping}"/></actuator></mujoco>""")
+    robot = robot_of(Task(model=model, frame_skip=5))
+    found = Finding(
+        name=name,
+        where="a",
+        strength=strength,
+        unit="kg m²",
+        ci95=(0.9 * strength, 1.1 * strength),
+        p_value=0.0,
+        share_of_gap=1.0,
+        strengths={"a": strength},
+    )
+    alarms = numerical([found], robot)
+    assert any("no more than another integrator adds" in alarm for alarm in alarms) == artefact

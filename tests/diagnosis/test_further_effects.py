@@ -60,3 +60,9 @@ def test_what_is_hardly_a_share_of_the_gap_is_named_if_one_effect_takes_all_of_i
         plain([*first, more], left),
     )
     assert identified(start, base, better, [better]) == added
+
+
+def test_what_a_force_a_little_off_would_leave_is_no_cause_of_its_own():
+    """A few hundred-thousandths of the gap, though six times the noise."""
+    start, base, better = plain([], 1e8), plain([A], 2400.0), plain([A, C], 450.0)
+    assert not identified(start, base, better, [better])

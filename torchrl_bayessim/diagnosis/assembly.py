@@ -18,7 +18,7 @@ from .candidates import candidates, concluded
 from .confusion import settled
 from .credit import credit_of, unit_credit, worthwhile
 from .divergence import divergence_alarms, diverges_throughout
-from .doubts import baseless, doubts
+from .doubts import baseless, doubts, numerical
 from .experiment import experiments
 from .figures import figures
 from .found import Found
@@ -78,6 +78,7 @@ def assemble(
     rollouts = rollout_errors(prepared, points)
     units = _every_unit(selection, scatter)
     errors = run_errors(prepared.sets, prepared.logs, best.fit.point)
+    by_integration = numerical(found.effects, system.robot)
     verdict, summary, more = conclude(
         system,
         prepared,
@@ -90,8 +91,8 @@ def assemble(
         where=where,
         diverges=diverges_throughout(rollouts),
         odd=odd_runs(errors),
-        baseless=baseless(found.effects, units),
-        doubts=doubts(found.effects, units, prepared),
+        baseless=bool(by_integration) or baseless(found.effects, units),
+        doubts=[*doubts(found.effects, units, prepared), *worse_rollouts(rollouts)],
         alpha=alpha,
     )
     if verdict == "unknown":
@@ -108,8 +109,8 @@ def assemble(
         *(str(f) for f in findings),
         *_absorbed(parameters),
         *odd_run_alarms(errors),
+        *by_integration,
         *divergence_alarms(prepared.sets["test"], told),
-        *(worse_rollouts(rollouts) if names else ()),
         *more,
     ]
     return Report(

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-__all__ = ["baseless", "doubts"]
+__all__ = ["baseless", "doubts", "numerical"]
 
 from collections.abc import Sequence
 
+import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
+from ..effects.joints import Armature
+from ..effects.robot import Robot
 from .objective import Unit
 from .preparation import Prepared
 from .report import Finding
@@ -54,6 +58,37 @@ def baseless(effects: Sequence[Finding], units: Sequence[Unit]) -> bool:
         )
         for effect in effects
     )
+
+
+def numerical(effects: Sequence[Finding], robot: Robot) -> list[str]:
+    """Return an alarm if all that was found is what another integrator would add.
+
+    With damping ``d`` and a time step ``h``, integrators that take damping implicitly move a joint
+    as if its inertia were larger by ``h d``, and explicit ones as if it were smaller.
+    """
+    places = {name: i for i, name in enumerate(robot.joints)}
+    if robot.model is None or not effects or {e.name for e in effects} != {Armature.name}:
+        return []
+    most = float(robot.model.opt.timestep) * _dampings(robot, robot.model)
+    strengths = {place: s for effect in effects for place, s in effect.strengths.items()}
+    if any(s > most[places[place]] for place, s in strengths.items() if place in places):
+        return []
+    some = ", ".join(f"{s:.2g} at {place}" for place, s in strengths.items())
+    return [
+        f"an armature of {some} explains the gap, but is no more than another integrator adds, "
+        "the time step times the damping: try a finer time step, or integrator='implicitfast'"
+    ]
+
+
+def _dampings(robot: Robot, model: mujoco.MjModel) -> NDArray[np.float64]:
+    """Return the damping of each joint, that of its servos with it."""
+    damping = model.dof_damping[list(robot.dof_index)].copy()
+    servos = -model.actuator_biasprm[:, 2] * (model.actuator_biastype != 0)
+    for joint, gear, one in zip(
+        robot.joint_of_actuator, model.actuator_gear[:, 0], servos, strict=True
+    ):
+        damping[joint] += one * gear**2 if joint >= 0 else 0.0
+    return damping
 
 
 def _ends(units: Sequence[Unit]) -> dict[tuple[str, str], tuple[float, float]]:

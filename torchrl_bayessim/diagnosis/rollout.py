@@ -50,8 +50,10 @@ def worse_rollouts(errors: Mapping[str, Mapping[str, float]]) -> list[str]:
     Example:
         >>> worse_rollouts({"refit": {"hinge": 0.8}, "with_effects": {"hinge": 3.8}})
         ['whole runs are predicted worse with the effects than without: hinge 3.8 against 0.8']
+        >>> worse_rollouts({"refit": {"hinge": 0.8}})  # nothing was found
+        []
     """
-    before, after = errors["refit"], errors["with_effects"]
+    before, after = errors["refit"], errors.get("with_effects", errors["refit"])
     found = [
         f"{name} {after[name]:.3g} against {before[name]:.3g}"
         for name in before
