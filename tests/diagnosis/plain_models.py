@@ -7,6 +7,7 @@ import numpy as np
 
 from torchrl_bayessim.diagnosis.model import Model
 from torchrl_bayessim.diagnosis.objective import Point
+from torchrl_bayessim.diagnosis.refit import Fit
 
 
 class Unit(NamedTuple):
@@ -26,5 +27,5 @@ def plain(units, deviance, *, z=0.0, segments=40, flipped=False):
     left = np.full((segments // 2, 10), np.sqrt(deviance / (10 * segments))) * (-1) ** flipped
     strengths = dict(units) if isinstance(units, dict) else dict.fromkeys(units, 1.0)
     point = Point(np.array([z]), strengths)
-    fit = SimpleNamespace(units=tuple(units), innovations=left, point=point, cost=deviance)
+    fit = Fit(point, tuple(units), left, np.zeros((left.size, 0)))
     return Model(fit=fit, validation=left, logs=np.arange(segments))

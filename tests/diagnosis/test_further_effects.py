@@ -11,32 +11,20 @@ from torchrl_bayessim.diagnosis.further_effects import identified
 )
 def test_what_has_the_same_beside_something_else_says_nothing_against_an_effect(rival, added):
     """A fiftieth of the gap, most of which the new effect explains; a rival is as good."""
-    start, base, better = (
-        plain([], 1e6),
-        plain([A], 20_000.0),
-        plain([A, C], 4000.0),
-    )
+    start, base, better = plain([], 1e6), plain([A], 20_000.0), plain([A, C], 4000.0)
     rivals = [better, plain(rival, 3990.0, flipped=True)]
     assert identified(start, base, better, rivals) == added
 
 
 def test_what_explains_the_same_under_another_name_says_nothing_against_an_effect():
-    start, base, better = (
-        plain([], 1e6),
-        plain([A], 20_000.0),
-        plain([A, C], 4000.0),
-    )
+    start, base, better = plain([], 1e6), plain([A], 20_000.0), plain([A, C], 4000.0)
     other = plain([A, Unit("delay", "x")], 3990.0)
     assert identified(start, base, better, [better, other])
 
 
 @pytest.mark.parametrize(("other", "added"), [(19_500.0, True), (17_000.0, False)])
 def test_a_third_of_what_is_left_is_enough_where_no_other_kind_comes_near(other, added):
-    start, base, better = (
-        plain([], 1e6),
-        plain([A], 20_000.0),
-        plain([A, C], 13_500.0),
-    )
+    start, base, better = plain([], 1e6), plain([A], 20_000.0), plain([A, C], 13_500.0)
     rival = plain([A, Unit("delay", "x")], other, flipped=True)
     assert identified(start, base, better, [better, rival]) == added
 
@@ -54,11 +42,7 @@ def test_what_is_hardly_a_share_of_the_gap_is_named_if_one_effect_takes_all_of_i
     first, more, left, added
 ):
     """Less than a hundredth, but five times the noise."""
-    start, base, better = (
-        plain([], 1e6),
-        plain(first, 2400.0),
-        plain([*first, more], left),
-    )
+    start, base, better = plain([], 1e6), plain(first, 2400.0), plain([*first, more], left)
     assert identified(start, base, better, [better]) == added
 
 

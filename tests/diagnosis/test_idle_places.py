@@ -43,10 +43,7 @@ def test_an_effect_with_next_to_no_credit_is_not_named(without, kept):
 @pytest.mark.parametrize(("share", "changed"), [(0.97, False), (0.5, True)])
 def test_more_strengths_do_not_take_the_place_of_fewer_that_are_as_good(share, changed):
     rng = np.random.default_rng(0)
-    best, more = (
-        plain([A], 5000.0),
-        plain([Unit("delay", "x"), Unit("delay", "y")], 5000.0),
-    )
+    best, more = plain([A], 5000.0), plain([Unit("delay", "x"), Unit("delay", "y")], 5000.0)
     each = rng.uniform(0.5, 1.5, len(best.validation))[:, None]  # better here, worse there
     fit = SimpleNamespace(units=more.units, innovations=np.sqrt(share) * each * more.validation)
     other = Model(fit=fit, validation=fit.innovations, logs=more.logs)

@@ -25,7 +25,7 @@ def candidates(
 ) -> tuple[Candidate, ...]:
     """Return what the data say about every unit."""
     seen = selection.screens[0]
-    dispersion = max(1.0, float((selection.nominal.fit.innovations**2).mean()))
+    dispersion = max(1.0, selection.nominal.fit.mean_square)
     used = set(selection.best.units)
     # what got another frequency in a later round is the same unit of the first
     later = {str(unit): unit for unit in used - set(seen.units)}

@@ -223,7 +223,7 @@ def _calm(selection: Selection) -> bool:
     best = selection.best
     if any(unit.effect.group == _LATE for unit in best.units):
         return False  # what varies is late on average
-    return max(float((best.fit.innovations**2).mean()), best.dispersion()) < _WHITE
+    return max(best.fit.mean_square, best.dispersion()) < _WHITE
 
 
 def _without(judged: Sequence[_Data], point: Point) -> Array:

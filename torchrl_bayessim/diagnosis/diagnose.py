@@ -28,7 +28,7 @@ from ..physics.mujoco import MujocoPhysics
 from .assembly import assemble
 from .chance import chances, detectable, of_chance, unseen
 from .holds import bridged
-from .late_sensors import LATE, rides_free, without_free_riders
+from .late_sensors import LATE, free_riders, without_free_riders
 from .losses import losses
 from .modes import MODES
 from .objective import Point, Unit, pushes_of, units_of
@@ -121,7 +121,7 @@ def diagnose(
         )
         selection = search(units)
         seen = prepared.sets["train"], prepared.noise
-        if rides_free(*seen, selection.nominal, selection.best):
+        if free_riders(*seen, selection.nominal, [selection.best]):
             prepared = prepared.alarmed(_TOO_SHORT.format(prepared.horizon))
             selection = search([unit for unit in units if unit.name not in LATE])
         selection = without_free_riders(*seen, selection)

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from ..effects.joints import Armature
 from ..effects.robot import Robot
+from ..effects.transmission import servo_damping
+from .cells import plain
 from .objective import Unit
 from .preparation import Prepared
 from .report import Finding
@@ -83,11 +85,9 @@ def numerical(effects: Sequence[Finding], robot: Robot) -> list[str]:
 def _dampings(robot: Robot, model: mujoco.MjModel) -> NDArray[np.float64]:
     """Return the damping of each joint, that of its servos with it."""
     damping = model.dof_damping[list(robot.dof_index)].copy()
-    servos = -model.actuator_biasprm[:, 2] * (model.actuator_biastype != 0)
-    for joint, gear, one in zip(
-        robot.joint_of_actuator, model.actuator_gear[:, 0], servos, strict=True
-    ):
-        damping[joint] += one * gear**2 if joint >= 0 else 0.0
+    servos = -servo_damping(robot).numpy() * model.actuator_gear[:, 0] ** 2
+    for joint, one in zip(robot.joint_of_actuator, servos, strict=True):
+        damping[joint] += one if joint >= 0 else 0.0
     return damping
 
 
@@ -101,7 +101,7 @@ def _at_end(strength: float, ends: tuple[float, float]) -> bool:
 
 
 def _of_strength(effect: Finding, ends: dict[tuple[str, str], tuple[float, float]]) -> list[str]:
-    name, unit = effect.name.replace("_", " "), effect.unit
+    name, unit = plain(effect.name), effect.unit
     texts = []
     for place, strength in effect.strengths.items():
         low, high = ends.get((effect.name, place), _ANYTHING)

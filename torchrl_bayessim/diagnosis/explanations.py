@@ -172,7 +172,7 @@ def _everything(seen: Screen) -> dict[Unit, float]:
 
 def bent(fit: Fit) -> bool:
     """Return whether so much is left that derivatives may mislead."""
-    return bool((fit.innovations**2).mean() > _BENT)
+    return fit.mean_square > _BENT
 
 
 def _plain(fit: Fit) -> bool:

@@ -96,5 +96,5 @@ def _leaves_less(start: Model, best: Model, share: float) -> bool:
 
     The true law in a simulator that integrates differently leaves as much.
     """
-    alone, left = (float((m.fit.innovations**2).mean()) - 1.0 for m in (start, best))
+    alone, left = (m.fit.mean_square - 1.0 for m in (start, best))
     return bool(best.units) and left < share * alone

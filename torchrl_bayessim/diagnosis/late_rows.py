@@ -24,19 +24,16 @@ def late_row_alarms(objective: Objective, nominal: Fit) -> list[str]:
         objective: Of the training segments.
         nominal: The parameters alone.
     """
-    before = _excess(nominal)
+    before = nominal.mean_square - 1.0
     if not objective.located or not objective.segments.ctrl.shape[-1] or before <= 0:
         return []
     segments = objective.segments
     earlier = replace(segments, ctrl=np.roll(segments.ctrl, -1, axis=1))
-    share = 1.0 - _excess(refit(objective.along(earlier), [nominal.point])[0]) / before
+    after = refit(objective.along(earlier), [nominal.point])[0].mean_square - 1.0
+    share = 1.0 - after / before
     if share < _SHARE:
         return []
     return [
         f"with the commands of the row after, {100 * share:.0f} % of the gap is gone: do rows hold "
         "the command that led to their state, and not the one that acts from there on?"
     ]
-
-
-def _excess(fit: Fit) -> float:
-    return float((fit.innovations**2).mean()) - 1.0

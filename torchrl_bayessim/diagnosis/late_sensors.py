@@ -9,8 +9,9 @@ steps that is all of it. (A delay of all channels alike is taken as one of all c
 
 from __future__ import annotations
 
-__all__ = ["LATE", "rides_free", "without_free_riders"]
+__all__ = ["LATE", "free_riders", "without_free_riders"]
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,28 +29,37 @@ _PREDICTED = 0.5  # of the rows that are compared: how many at least are predict
 _MORE = 0.5  # of the error that it has for nothing: what it may leave
 
 
-def rides_free(objective: Objective, noise: Array, nominal: Model, model: Model) -> bool:
-    """Return whether a model has late sensors for nothing.
+def free_riders(
+    objective: Objective, noise: Array, nominal: Model, models: Sequence[Model]
+) -> set[Model]:
+    """Return those models that have late sensors for nothing.
 
     Args:
         objective: Of the segments to look at.
         noise: Standard deviation of each channel's noise.
         nominal: Parameters alone.
-        model: With effects.
+        models: With effects.
     """
-    if not objective.located or not any(unit.name in LATE for unit in model.units):
-        return False
-    points = [nominal.fit.point, model.fit.point]
-    errors = objective.raw(points) * objective.whitening.weights[:, None, None]
-    before, after = np.nanmean((errors / noise) ** 2, axis=1)  # (K, C) each
-    return _no_more(before, after, _steps(objective, model.fit.point), objective.segments.checked)
+    late = [m for m in models if any(unit.name in LATE for unit in m.units)]
+    if not objective.located or not late:
+        return set()
+    errors = objective.raw([m.fit.point for m in (nominal, *late)])
+    errors = errors * objective.whitening.weights[:, None, None]
+    before, *left = np.nanmean((errors / noise) ** 2, axis=1)  # (K, C) each
+    checked = objective.segments.checked
+    return {
+        model
+        for model, after in zip(late, left, strict=True)
+        if _no_more(before, after, _steps(objective, model.fit.point), checked)
+    }
 
 
 def without_free_riders(objective: Objective, noise: Array, selection: Selection) -> Selection:
     """Return what was found, without rivals of late sensors that explain nothing."""
-    start = selection.nominal
+    rivals = [m for models in selection.alternatives.values() for m in models]
+    riders = free_riders(objective, noise, selection.nominal, rivals)
     others = {
-        name: tuple(m for m in models if not rides_free(objective, noise, start, m))
+        name: tuple(m for m in models if m not in riders)
         for name, models in selection.alternatives.items()
     }
     return replace(selection, alternatives=others)

@@ -12,15 +12,14 @@ __all__ = ["with_fitted_phases"]
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from ..effects.disturbance import Cogging, PeriodicDisturbance
-from ..effects.robot import Robot
+from ..effects.units import slides
 from .model import LIKELY, Model, judged
 from .objective import Objective, Point, Unit
-from .refit import refit
+from .refit import refit, with_prior
 
 Array = NDArray[np.float64]
 _STEPS = 4  # of Gauss and Newton
@@ -69,8 +68,9 @@ def _shifts(train: Objective, model: Model) -> list[_Shift]:
             latest = float(np.abs(segments.time).max())
             shifts.append(_Shift(unit, "frequency", _MOVED / (2 * np.pi * max(latest, 1e-9))))
         elif isinstance(unit.effect, Cogging):
-            if _slides(train, robot, unit):
-                where = segments.qpos[..., robot.qpos_index[unit.joint(robot)]]
+            joint = unit.joint(robot)
+            if slides(robot, joint):
+                where = segments.qpos[..., robot.qpos_index[joint]]
                 farthest = float(np.abs(where).max())
                 shifts.append(_Shift(unit, "number", _MOVED / max(farthest, 1e-9)))
         else:
@@ -79,22 +79,14 @@ def _shifts(train: Objective, model: Model) -> list[_Shift]:
     return shifts
 
 
-def _slides(train: Objective, robot: Robot, unit: Unit) -> bool:
-    model = train.predictor.system.task.model
-    joint = model.dof_jntid[robot.dof_index[unit.joint(robot)]]
-    return bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE)
-
-
 def _moved(train: Objective, model: Model, shifts: Sequence[_Shift]) -> Point:
     """Return where one step of Gauss and Newton leads."""
     fit, size = model.fit, len(model.fit.point.z)
     tries = [_with(fit.point, [shift], [shift.width]) for shift in shifts]
     changes = (train(tries) - fit.innovations).reshape(len(shifts), -1)
     columns = np.concatenate([fit.jacobian, changes.T], axis=1)
-    prior = np.zeros((size, columns.shape[1]))
-    prior[:, :size] = np.eye(size)
     left = np.r_[fit.innovations.ravel(), fit.point.z]
-    step = -np.linalg.lstsq(np.concatenate([columns, prior]), left, rcond=None)[0]
+    step = -np.linalg.lstsq(with_prior(columns, size), left, rcond=None)[0]
     strengths = {
         unit: unit.inside(fit.point.strengths[unit] + unit.high * step[size + i])
         for i, unit in enumerate(fit.units)

@@ -6,7 +6,7 @@ finite differences, which effects such as a delay or a dead band also have.
 
 from __future__ import annotations
 
-__all__ = ["WIDE", "Fit", "refit", "with_width"]
+__all__ = ["WIDE", "Fit", "refit", "with_prior", "with_width"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -46,6 +46,11 @@ class Fit:
     def misfit(self) -> float:
         """``Σ w_i ‖L_i⁻¹ r_i‖²``."""
         return float((self.innovations**2).sum())
+
+    @property
+    def mean_square(self) -> float:
+        """The mean squared innovation."""
+        return float((self.innovations**2).mean())
 
     @property
     def cost(self) -> float:
@@ -157,6 +162,13 @@ def refit(
         Fit(_point(d.vector, units, objective.size), units, d.residual, d.jacobian)
         for d, units in zip(descents, models, strict=True)
     ]
+
+
+def with_prior(jacobian: Array, size: int) -> Array:
+    """Return derivatives with those of ``z``, the first ``size`` coordinates, below them."""
+    prior = np.zeros((size, jacobian.shape[1]))
+    prior[:, :size] = np.eye(size)
+    return np.concatenate([jacobian, prior])
 
 
 def with_width(objective: Objective, point: Point) -> Objective:

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .objective import Objective, Point, Unit
-from .refit import Fit
+from .refit import Fit, with_prior
 
 Array = NDArray[np.float64]
 LEVELS = (0.05, 0.4)  # of an effect's range
@@ -234,10 +234,7 @@ def _compared(
 
 def _basis(fit: Fit, size: int) -> Array:
     """Return an orthonormal basis of what the fit's own parameters can explain."""
-    columns = fit.jacobian
-    prior = np.zeros((size, columns.shape[1]))
-    prior[:, :size] = np.eye(size)
-    stacked = np.concatenate([columns, prior])
+    stacked = with_prior(fit.jacobian, size)
     if not stacked.shape[1]:
         return np.zeros((len(stacked), 0))
     left, values, _ = np.linalg.svd(stacked, full_matrices=False)

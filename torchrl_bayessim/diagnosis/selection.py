@@ -165,7 +165,7 @@ def _p_value(seen: Screen, model: Model, generator: np.random.Generator) -> floa
     """Return how often noise alone would give the largest likelihood ratio of the screen."""
     if not len(seen.units):
         return 1.0
-    dispersion = max(1.0, float((model.fit.innovations**2).mean()))
+    dispersion = max(1.0, model.fit.mean_square)
     largest = float(seen.ratios(dispersion).max())
     null = seen.null(1000, generator)
     above = float((null >= largest).mean())

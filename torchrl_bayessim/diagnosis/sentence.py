@@ -8,6 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from ..logs.system import System
+from .cells import plain
 from .preparation import Prepared
 from .report import Candidate, Finding, Verdict
 from .shrinkage import Shrinkage
@@ -69,7 +70,7 @@ def sentence(
         share = "found on other runs, too small to matter on test runs"
     others = _rivals_of_others(effects, confused)
     if verdict == "ambiguous":
-        equals = ", ".join(map(_spaced, confused))
+        equals = ", ".join(map(plain, confused))
         return (
             f"{gap} These data cannot tell the causes apart: {equals}. The first, {causes}, "
             f"{share}.{others}{parameters}{untested}"
@@ -78,14 +79,14 @@ def sentence(
     partial = verdict != "named" and validated is None and measured.refit > NEGLIGIBLE
     text += f"; {_percent(1 - measured.explained)} remain." if partial else "."
     if len(confused) > 1:
-        text += f" Not separable from: {', '.join(map(_spaced, confused[1:]))}."
+        text += f" Not separable from: {', '.join(map(plain, confused[1:]))}."
     return f"{text}{others}{parameters}{untested}"
 
 
 def _rivals_of_others(effects: Sequence[Finding], confused: Sequence[str]) -> str:
     """Return what may stand in the place of effects beside the first."""
     return "".join(
-        f" In the place of {_spaced(e.name)} it may be: {', '.join(map(_spaced, e.rivals))}."
+        f" In the place of {plain(e.name)} it may be: {', '.join(map(plain, e.rivals))}."
         for e in effects
         if e.rivals and e.name not in confused[:1]
     )
@@ -163,13 +164,9 @@ def _percent(share: float) -> str:
     return "over 99 %" if text == "100 %" and share < 1.0 else text
 
 
-def _spaced(name: str) -> str:
-    return name.replace("_", " ")
-
-
 def _described(effect: Finding) -> str:
     half = (effect.ci95[1] - effect.ci95[0]) / 2
-    name = _spaced(effect.name)
+    name = plain(effect.name)
     law = "".join(text.format(effect.form[k]) for k, text in _FORMS.items() if k in effect.form)
     if len(effect.strengths) > 1:
         least, most = (pick(effect.strengths.values()) for pick in (min, max))
@@ -187,7 +184,7 @@ def _ruled_out(candidates: Sequence[Candidate]) -> str:
     found: dict[str, str] = {}
     for c in candidates:
         if c.status == "ruled_out" and c.minimal_detectable_strength is not None:
-            name, least = _spaced(c.name), c.minimal_detectable_strength
+            name, least = plain(c.name), c.minimal_detectable_strength
             text = f"{name} above {least:.2g} {c.unit} {_place(c)}"
             found.setdefault(c.name, text)
     some = list(found.values())[:4]
@@ -204,6 +201,6 @@ def _untested(candidates: Sequence[Candidate]) -> str:
     for c in candidates:
         by_name.setdefault(c.name, []).append(c.status)
     names = [name for name, seen in by_name.items() if set(seen) == {"not_excited"}]
-    shown = ", ".join(map(_spaced, names[:5]))
+    shown = ", ".join(map(plain, names[:5]))
     more = f" and {len(names) - 5} more" if len(names) > 5 else ""
     return f" Could not be tested: {shown}{more}." if names else ""

@@ -16,13 +16,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from ..effects.action import ActionQuantization
 from ..effects.disturbance import Cogging, PeriodicDisturbance
 from ..effects.effect import Effect
+from ..effects.units import slides
 from ..logs.log import Log
 from .location import missing_force
 from .objective import Objective, Point, Unit, parameters_at, units_of
@@ -68,7 +68,6 @@ def shaped(
     span = float(np.mean([len(log) for log in logs])) * system.control_dt
     frequencies = np.arange(_SLOWEST / span, 0.5 / spacing, 0.125 / span)
     window = slice(pieces.history, pieces.history + _STEPS)
-    dof_joints = system.task.model.dof_jntid[list(system.robot.dof_index)]
     units: list[Unit] = []
     for i, push in enumerate(pushes):
         joint = push.joint(system.robot)
@@ -77,8 +76,7 @@ def shaped(
         best = _sine(force[:, i], 2 * np.pi * time, frequencies)
         if best is not None:
             found.append(PeriodicDisturbance(frequency=best[0], phase=best[1]))
-        sliding = system.task.model.jnt_type[dof_joints[joint]] == mujoco.mjtJoint.mjJNT_SLIDE
-        rates = _waves(positions) if sliding else _NUMBERS
+        rates = _waves(positions) if slides(system.robot, joint) else _NUMBERS
         best = _sine(force[:, i], positions[:, _STEPS // 2], rates)
         if best is not None:
             found.append(Cogging(number=best[0], phase=best[1]))

@@ -13,6 +13,7 @@ __all__ = [
     "ServoDeadBand",
     "TorqueSpeedLimit",
     "driven",
+    "servo_damping",
     "servos",
 ]
 
@@ -122,7 +123,7 @@ class ServoDeadBand(_Transmission):
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the actuators' names, none if the force of one is not known."""
         names = super().targets(robot)
-        return names if self.damped or (names and bool(_damping(robot).any())) else ()
+        return names if self.damped or (names and bool(servo_damping(robot).any())) else ()
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and a tenth of a unit or of ``u_max``."""
@@ -135,12 +136,12 @@ class ServoDeadBand(_Transmission):
         """Return the change of commands."""
         force = now.actuator_force
         if not self.damped:
-            force = force - _damping(now.robot).to(force) * now.actuator_velocity
+            force = force - servo_damping(now.robot).to(force) * now.actuator_velocity
         error = force / now.actuator_gain
         return {"command": -error.clamp(-strength, strength)}, memory
 
 
-def _damping(robot: Robot) -> Tensor:
+def servo_damping(robot: Robot) -> Tensor:
     """Return the force of each actuator per unit of its velocity."""
     model = robot.require_model()
     return torch.from_numpy(model.actuator_biasprm[:, 2] * (model.actuator_biastype != 0))

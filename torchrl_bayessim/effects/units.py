@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["unit_at"]
+__all__ = ["slides", "unit_at"]
 
 import mujoco
 
@@ -37,13 +37,14 @@ def unit_at(effect: Effect, robot: Robot, target: int) -> str:
         if kind not in {"position", "velocity"}:
             return effect.unit
         rates = (kind == "velocity") + effect.unit.endswith("/s")
-        return ("m" if _slides(robot, joint) else "rad") + ("", "/s", "/s²")[rates]
-    if _slides(robot, joint):
+        return ("m" if slides(robot, joint) else "rad") + ("", "/s", "/s²")[rates]
+    if slides(robot, joint):
         return _OF_SLIDES.get(effect.unit, effect.unit)
     return effect.unit
 
 
-def _slides(robot: Robot, joint: int) -> bool:
+def slides(robot: Robot, joint: int) -> bool:
+    """Return whether a joint moves along a line."""
     if robot.model is None or joint < 0:
         return False
     number = robot.model.dof_jntid[robot.dof_index[joint]]
