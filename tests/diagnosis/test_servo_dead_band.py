@@ -13,8 +13,8 @@ SERVO = ARM.replace(
 )
 
 
-def banded(*, damped):
-    """Return the commands, and what a band takes from a servo, held for a control step."""
+def banded(*, damped, held):
+    """Return the commands, and what a band takes from a servo: at all times or per command."""
     now = {}
 
     def act(u, k):
@@ -23,7 +23,7 @@ def banded(*, damped):
         return u[k]
 
     def push(q, v):
-        if now["lost"] is None:
+        if now["lost"] is None or not held:
             error = now["target"] - q - damped * KV / KP * v
             now["lost"] = np.clip(error, -BAND, BAND)
         return -KP * now["lost"]
@@ -31,16 +31,18 @@ def banded(*, damped):
     return {"act": act, "push": push, "xml": SERVO}
 
 
+@pytest.mark.parametrize("held", [False, True])
 @pytest.mark.parametrize("damped", [True, False])
-def test_the_dead_band_of_a_servo_is_told_from_friction(damped):
+def test_the_dead_band_of_a_servo_is_told_from_friction(damped, held):
     report = diagnose(
         system(SERVO),
         None,
-        logs(**banded(damped=damped)),
+        logs(**banded(damped=damped, held=held)),
         effects=["dead_band", "coulomb_friction", "stribeck_friction", "action_gain"],
     )
     assert report.confusion_set == ("dead_band",)
     (found,) = report.effects
     assert found.form == {"damped": damped}
-    assert found.strength == pytest.approx(BAND, rel=0.1)
+    # held and with damping it is a band that acts late, of which half is found
+    assert found.strength == pytest.approx(BAND, rel=0.6 if held and damped else 0.1)
     assert report.gap.explained_fraction > 0.8

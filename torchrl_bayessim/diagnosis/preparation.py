@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..effects.transmission import servos
 from ..errors import message
 from ..logs.log import Log
 from ..logs.system import System
@@ -165,7 +166,11 @@ def prepare(
     estimated = parts["train"][0].uncertainty is not None
     mode = mode or (Trajectories() if estimated else Mode())
     some = cut(parts["train"], min(_STEPS, rows // 2), history=history, most=_FEW)
-    predictor = with_fewest_steps(predictor, some, units, z=origin(system.prior), noise=noise)
+    if servos(system.robot):
+        # a loop of some milliseconds, which forces that are held for ten would leave open
+        predictor.exactly()
+    else:
+        predictor = with_fewest_steps(predictor, some, units, z=origin(system.prior), noise=noise)
     noise, source = mode.noise(predictor, parts["train"], history=history, alarms=alarms)
     parts = _in_contact(predictor, parts, noise=noise, history=history)
     if horizon is None:
