@@ -19,6 +19,7 @@ from tqdm.auto import tqdm
 
 from torchrl_bayessim import checkpoint
 from torchrl_bayessim.loop import ended_return
+from torchrl_bayessim.overlapped import Overlapped
 from torchrl_bayessim.randomness import isolated, seed_from
 from torchrl_bayessim.simulate import make_collector, next_batch
 from torchrl_bayessim.transforms import DomainRandomizer
@@ -118,22 +119,21 @@ def _chunk(
     with isolated(*key, first, "reset"):
         collector.set_seed(seed_from(*key, first, "env") % 2**31)
         collector.reset()
-    for index in range(first, min(first + plan.keep_every, plan.batches)):
+    learning = Overlapped(learner)
+    for index in range(first, (until := min(first + plan.keep_every, plan.batches))):
         wall, cpu = time.monotonic(), time.process_time()
         with isolated(*key, index):
-            batch = next_batch(collector)
+            batch = next_batch(collector, meanwhile=learning.meanwhile)
         batch = batch.reshape(-1, batch.shape[-1])
         progress = index / plan.batches if plan.decays else 0.0
-        reported = learner.update(batch, key=(*key, index), progress=progress)
         last = state["curve"][-1] if state["curve"] else {}
-        point = {
-            "frames": last.get("frames", 0.0) + batch.numel(),
-            "return": ended_return(batch),
-            **reported,
-            "seconds": last.get("seconds", 0.0) + time.monotonic() - wall,
-            "cpu_seconds": last.get("cpu_seconds", 0.0) + time.process_time() - cpu,
-        }
+        last |= learning.update(batch, key=(*key, index), progress=progress)
+        point = {"frames": last.get("frames", 0.0) + batch.numel(), "return": ended_return(batch)}
         due = (index + 1) % plan.score_every == 0 or index + 1 == plan.batches
+        if due or index + 1 == until:
+            point |= learning.finish()
+        point["seconds"] = last.get("seconds", 0.0) + time.monotonic() - wall
+        point["cpu_seconds"] = last.get("cpu_seconds", 0.0) + time.process_time() - cpu
         if score is not None and due:
             point["score"] = score(learner.policy)
             bar.set_postfix(score=f"{point['score']:.2f}")

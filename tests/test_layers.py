@@ -39,7 +39,7 @@ LAYERS = [
         "excitation",
         "diagnosis",
     },
-    {"evidence"},
+    {"evidence", "overlapped"},
     {"loop"},
     {"trainer"},
 ]

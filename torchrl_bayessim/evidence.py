@@ -10,7 +10,7 @@ from __future__ import annotations
 __all__ = ["Evidence", "EvidenceSimulator"]
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypedDict
 
 import torch
@@ -89,12 +89,17 @@ class EvidenceSimulator:
             self.collector.set_seed(seed_from(*key, "env") % 2**31)
             self.collector.reset()
 
-    def batch(self, key: tuple[int | str, ...]) -> TensorDictBase:
-        """Return the next training batch, ``[N, T]``, collected with the present policy."""
+    def batch(
+        self, key: tuple[int | str, ...], *, meanwhile: Callable[[float], None] | None = None
+    ) -> TensorDictBase:
+        """Return the next training batch, ``[N, T]``, collected with the present policy.
+
+        ``meanwhile``: See `next_batch`.
+        """
         if self.collectors is not None:
             return self.collectors.batch(self.policy)
         with isolated(*key):
-            batch = next_batch(self.collector)
+            batch = next_batch(self.collector, meanwhile=meanwhile)
         return batch.reshape(-1, batch.shape[-1])
 
     @property

@@ -40,6 +40,7 @@ from .inference.fit import FitReport
 from .inference.physics_posterior import PhysicsPosterior
 from .inference.refinement import PosteriorRefinement
 from .kinds import check_function, check_kind
+from .overlapped import Overlapped
 from .ray_collectors import RayCollectors
 from .real_trajectories import (
     check_columns,
@@ -203,6 +204,7 @@ class SimToRealLoop:
             settings: dict[str, Any] = getattr(owner, "settings", {})
             self.settings |= {f"{part}.{name}": value for name, value in settings.items()}
         self.learner, self.robot = learner, robot
+        self._overlapped = Overlapped(learner)
         self.refinement, self.statistics, self.randomizer = refinement, statistics, randomizer
         self.horizon, self.episodes, self.rounds = horizon, episodes, rounds
         self.updates, self.shared_batches = updates, shared_batches
@@ -318,6 +320,7 @@ class SimToRealLoop:
         state["fit"] = dataclasses.asdict(report)
         if shared:  # collected with this very policy: the learner's first update of the round
             self._update(concatenate(shared))
+            self._finish()
 
     def _train(self) -> None:
         state = self._state
@@ -327,7 +330,9 @@ class SimToRealLoop:
         self._simulator.begin(key)
         label = f"round {state['round'] + 1} of {self.rounds}: train"
         for update in tqdm(range(first, last), desc=label, disable=not self.progress, leave=False):
-            self._update(self._simulator.batch((*key, update)))
+            meanwhile = self._overlapped.meanwhile
+            self._update(self._simulator.batch((*key, update), meanwhile=meanwhile))
+        self._finish()
         state["update"] = last
 
     def _update(self, batch: TensorDictBase) -> None:
@@ -337,12 +342,21 @@ class SimToRealLoop:
         key = (self.seed, "round", state["round"], "update", len(state["curve"]))
         seen = [*self.learner.policy.in_keys, "reward"]
         usable, dropped = finite_rows(batch, [*seen, *map(next_key, seen)])
-        reported = self.learner.update(usable, key=key, progress=done / planned)
+        self._tell(self._overlapped.update(usable, key=key, progress=done / planned))
         state["frames"] += batch.numel()
-        entry = {"frames": float(state["frames"]), "return": ended_return(usable), **reported}
+        entry = {"frames": float(state["frames"]), "return": ended_return(usable)}
         if dropped:
             entry["dropped"] = float(dropped)
         state["curve"] = [*state["curve"], entry]
+
+    def _finish(self) -> None:
+        self._tell(self._overlapped.finish())
+
+    def _tell(self, reported: Mapping[str, float]) -> None:
+        """Add to the last entry of the curve what the learner reports of it."""
+        if reported:
+            *earlier, last = self._state["curve"]
+            self._state["curve"] = [*earlier, {**last, **reported}]
 
     # Keeping work.
 

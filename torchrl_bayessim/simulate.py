@@ -17,7 +17,8 @@ __all__ = [
 ]
 
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,7 @@ from torchrl.envs import EnvBase
 
 from .counts import check_count
 from .diverged import UndisturbedPolicy, check_policy
+from .envs.mujoco import BatchedMujocoEnv
 from .errors import PhysicsError, SimulationError, message
 from .kinds import check_function, check_kind
 from .pairs import counted, empty_pairs, fill_parameters, fill_summaries
@@ -72,14 +74,23 @@ def check_parts(env: object, statistics: object, randomizer: object) -> None:
     check_kind("a DomainRandomizer", randomizer, DomainRandomizer)
 
 
-def next_batch(collector: BaseCollector) -> Any:
+def next_batch(
+    collector: BaseCollector, *, meanwhile: Callable[[float], None] | None = None
+) -> Any:
     """Return the collector's next batch.
+
+    Args:
+        collector: Collects.
+        meanwhile: Called in this thread during every step that a batched environment simulates in
+            others, with the share of the batch's steps that have begun. Never called where the
+            environment is of another kind. It does not fail.
 
     Raises:
         SimulationError: The collector failed, for instance because a policy was given NaN.
     """
     try:
-        return collector.next()
+        with _working(collector, meanwhile):
+            return collector.next()
     except RuntimeError as error:
         raise SimulationError(
             message(
@@ -89,6 +100,19 @@ def next_batch(collector: BaseCollector) -> Any:
                 "last finite observation, as the batched environments do",
             )
         ) from error
+
+
+@contextmanager
+def _working(collector: Any, meanwhile: Callable[[float], None] | None) -> Iterator[None]:
+    env = getattr(collector, "env", None)
+    env = getattr(env, "base_env", env)
+    if meanwhile is None or not isinstance(env, BatchedMujocoEnv):
+        yield
+        return
+    steps = collector.requested_frames_per_batch // env.batch_size.numel()
+    begun = count(1)
+    with env.meanwhile(lambda: meanwhile(next(begun) / steps)):
+        yield
 
 
 def summaries_in_turn(

@@ -29,6 +29,7 @@ from torchrl_bayessim import ApplyPhysics, BoxPrior, DomainRandomizer, MujocoPhy
 from torchrl_bayessim.agents.ddpg import DDPG
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.envs.tasks.fetch import goal_reward
+from torchrl_bayessim.overlapped import Overlapped
 from torchrl_bayessim.randomness import isolated
 from torchrl_bayessim.simulate import make_collector, next_batch
 
@@ -59,14 +60,15 @@ def loop(env: EnvBase, updates: float, batches: int) -> Callable[[], int]:
     """Return a case: ``batches`` batches of whole episodes, and the updates that go with them."""
     frames = env.batch_size.numel() * STEPS
     learner = DDPG(env, goal_reward, updates_per_frame=updates)
+    learning = Overlapped(learner)
     collector = make_collector(env, learner.policy, steps=STEPS)
 
     def case() -> int:
         for index in range(batches):
             with isolated(index):
-                batch: Any = next_batch(collector)
+                batch: Any = next_batch(collector, meanwhile=learning.meanwhile)
             if updates:
-                learner.update(batch, key=(index,))
+                learning.update(batch, key=(index,))
             else:
                 learner.buffer.extend(batch.select(*learner.kept_keys))
         return batches * frames

@@ -61,9 +61,11 @@ def test_losses_and_gradients_are_torchrls(kind, batch):
     loss = made(kind, updated=True)
     for own, theirs in zip((kind.critic_loss, kind.policy_loss), LOSSES[kind], strict=True):
         values = []
+        with isolated("target noise"):
+            noise = torch.randn_like(batch["action"])
         for function in (own, theirs):
             with isolated("target noise"):
-                found = function(loss, batch.clone())
+                found = function(loss, batch.clone().update({"noise": noise}))
             values.append(found if torch.is_tensor(found) else found[0])
         torch.testing.assert_close(*values, rtol=1e-6, atol=1e-7)
         ours, expected = (gradients(loss, value) for value in values)

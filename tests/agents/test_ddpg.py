@@ -153,6 +153,71 @@ def test_resumed_it_learns_the_same(episodes):
     assert not changed(learner._tensors(), twin._tensors())
 
 
+@pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
+def test_updates_that_are_owed_are_those_of_an_update(episodes, algorithm):
+    learner, twin = (DDPG(push(), goal_reward, algorithm=algorithm, **SMALL) for _ in range(2))
+    reported = learner.update(episodes, key=(0,))
+    twin.begin(episodes, key=(0,))
+    assert changed(learner._tensors(), twin._tensors())
+    for share in (0.1, 0.11, 0.7):
+        torch.rand(3)  # of somebody else
+        with torch.no_grad():
+            twin.work(share)
+    assert changed(learner._tensors(), twin._tensors())
+    assert twin.finish() == reported
+    assert not changed(learner._tensors(), twin._tensors())
+    assert twin.finish() == {}
+
+
+def test_owed_updates_draw_nothing_from_the_global_generators(episodes):
+    learner = DDPG(push(), goal_reward, algorithm="td3", **SMALL)
+    torch.manual_seed(5)
+    expected = torch.rand(4)
+    torch.manual_seed(5)
+    learner.begin(episodes, key=(0,))
+    learner.work(0.5)
+    learner.finish()
+    assert torch.equal(torch.rand(4), expected)
+
+
+def test_a_failure_in_the_midst_is_told_at_the_end_and_undone(episodes):
+    learner = DDPG(push(), goal_reward, **SMALL)
+    before = {name: value.clone() for name, value in learner._tensors().items()}
+    learner.begin(episodes, key=(0,))
+    learner.work(0.5)
+    name = "value_network_params.module.layers.0.weight"
+    learner._tensors()[name][0, 0] = torch.nan
+    learner.work(1.0)
+    with pytest.raises(SimulationError, match="finite loss of the critic, got nan"):
+        learner.finish()
+    assert not changed(before, learner._tensors())
+
+
+def test_a_checkpoint_owes_nothing(episodes):
+    learner, twin = (DDPG(push(), goal_reward, **SMALL) for _ in range(2))
+    learner.begin(episodes, key=(0,))
+    twin.load_state_dict(copy.deepcopy(learner.state_dict()))
+    twin.begin(episodes, key=(1,))
+    learner.update(episodes, key=(1,))
+    twin.finish()
+    assert not changed(learner._tensors(), twin._tensors())
+
+
+def test_hidden_layers_in_bfloat16_change_little(episodes):
+    learner = DDPG(push(), goal_reward)
+    seen, action = learner.state.full(episodes), episodes["action"]
+    critic = learner._loss._networks.critic
+    exact = critic(seen, action)
+    precision = torch.get_float32_matmul_precision()
+    try:
+        torch.set_float32_matmul_precision("medium")
+        rounded = critic(seen, action)
+    finally:
+        torch.set_float32_matmul_precision(precision)
+    assert rounded.dtype == torch.float32
+    assert (rounded - exact).norm() < 0.02 * exact.norm()
+
+
 def test_the_learning_rate_is_constant_and_then_falls(episodes):
     learner = DDPG(push(), goal_reward, **SMALL | {"updates_per_frame": 1 / 200})
     rates = [

@@ -143,7 +143,8 @@ class BoundedDDPGLoss(_Bounded, DDPGLoss):
 class BoundedTD3Loss(_Bounded, TD3Loss):
     """TD3 (Fujimoto et al. 2018): the lower of two critics, under noisy target actions.
 
-    Its delayed actor is the caller's part: ask for `policy_loss` less often than `critic_loss`.
+    Its delayed actor is the caller's part: ask for `policy_loss` less often than `critic_loss`. So
+    is the noise, whose entry holds standard normal numbers of the actions' shape.
     Arguments are those of `BoundedDDPGLoss`.
     """
 
@@ -157,7 +158,7 @@ class BoundedTD3Loss(_Bounded, TD3Loss):
     def critic_loss(self, batch: TensorDictBase) -> Tensor:
         """Return the mean squared errors of both critics, added."""
         networks, after, action = self._networks, batch.get("next"), batch.get("action")
-        noise = torch.randn_like(action) * self.policy_noise
+        noise = batch.get("noise") * self.policy_noise
         noise = noise.clamp(-self.noise_clip, self.noise_clip)
         with torch.no_grad():
             state = after.get("state")

@@ -28,6 +28,7 @@ from ..scalars import check_number
 from .actor_critic_losses import BoundedDDPGLoss, BoundedTD3Loss, SoftUpdateAtOnce
 from .goal_networks import GOAL_KEYS, Actor, Critic, GoalState, action_bounds, goal_policy
 from .hindsight import GoalReward, HindsightReplayBuffer
+from .owed_updates import OwedUpdates
 
 _LOSSES = {"ddpg": BoundedDDPGLoss, "td3": BoundedTD3Loss}
 _AT_ONCE = 160  # batches sampled in one go
@@ -158,6 +159,8 @@ class DDPG:
             reward, capacity=capacity, share=relabelled, moving=moving
         )
         self._targets = SoftUpdateAtOnce(self._loss, tau=tau)
+        self._owed: tuple[OwedUpdates, dict[str, Any]] | None = None
+        self._report: dict[str, float] = {}
         self._optimizers = {
             part: torch.optim.Adam(self._parameters(part), lr=learning_rate, fused=True)
             for part in ("actor", "critic")
@@ -183,17 +186,58 @@ class DDPG:
             SimulationError: A value in the batch or a loss is not finite. The networks are then
                 as they were before.
         """
+        self.begin(batch, key=key, progress=progress)
+        return self.finish()
+
+    def begin(
+        self, batch: TensorDictBase, *, key: Sequence[int | str], progress: float = 0.0
+    ) -> None:
+        """Take in ``batch`` as `update` does; `work` and `finish` make the updates.
+
+        Updates that are still owed are made before.
+        """
+        self.finish()
         self._check(batch)
         kept = batch.select(*self.kept_keys)
         before = copy.deepcopy(self._learned())
+        self.buffer.extend(kept)
+        if len(self.buffer) < self.batch_size:
+            raise ValueError(
+                message(
+                    f"a replay buffer that holds at least one batch of {self.batch_size}",
+                    len(self.buffer),
+                    hint="more environments, or a smaller batch_size",
+                )
+            )
+        self.state.observe(kept)
+        updates = round(self.updates_per_frame * batch.numel())
+        self._report = {"updates": float(updates), "learning_rate": self._set_rate(progress)}
+        self._owed = OwedUpdates(self._updates(updates, tuple(key)), updates), before
+
+    def work(self, share: float) -> None:
+        """Make updates until this share of those that `begin` owed is made.
+
+        They draw nothing from global generators, so this may happen in the midst of what does.
+        """
+        if self._owed is not None:
+            with torch.enable_grad():  # collectors forbid gradients
+                self._owed[0].work(share)
+
+    def finish(self) -> dict[str, float]:
+        """Make the updates that are left, and return what `update` does; empty if none was owed.
+
+        Raises:
+            SimulationError: As `update`.
+        """
+        if self._owed is None:
+            return {}
+        (owed, before), self._owed = self._owed, None
         try:
-            with isolated(self.seed, "ddpg update", *key):
-                self.buffer.extend(kept)
-                self.state.observe(kept)
-                return self._optimise(round(self.updates_per_frame * batch.numel()), progress)
+            owed.finish()
         except SimulationError:
             self._learn(before)
             raise
+        return self._report
 
     def _check(self, batch: TensorDictBase) -> None:
         for key in self.kept_keys:
@@ -215,46 +259,43 @@ class DDPG:
         following = [("next", key) for key in (*states, "reward", "done", "terminated")]
         return [*states, "action", *following]
 
-    def _optimise(self, updates: int, progress: float) -> dict[str, float]:
-        if len(self.buffer) < self.batch_size:
-            raise ValueError(
-                message(
-                    f"a replay buffer that holds at least one batch of {self.batch_size}",
-                    len(self.buffer),
-                    hint="more environments, or a smaller batch_size",
-                )
-            )
-        rate = self._set_learning_rate(progress)
+    def _updates(self, count: int, key: tuple[int | str, ...]) -> Iterator[None]:
+        """Make an update at each turn; the report has the means of their losses."""
         sums = {"actor": 0.0, "critic": 0.0}
-        for index, steps in enumerate(self._replayed(updates)):
+        for index, steps in enumerate(self._replayed(count, key)):
             sums["critic"] += self._step("critic", self._loss.critic_loss(steps))
             if (index + 1) % self._actor_every == 0:
                 sums["actor"] += self._step("actor", self._loss.policy_loss(steps))
             self._targets.step()
-        counts = {"actor": updates // self._actor_every, "critic": updates}
-        means = {f"loss_{part}": sums[part] / max(1, counts[part]) for part in sums}
-        return means | {"updates": float(updates), "learning_rate": rate}
+            made = {"actor": (index + 1) // self._actor_every, "critic": index + 1}
+            self._report |= {f"loss_{part}": sums[part] / max(1, made[part]) for part in sums}
+            yield
 
-    def _replayed(self, updates: int) -> Iterator[TensorDictBase]:
+    def _replayed(self, updates: int, key: tuple[int | str, ...]) -> Iterator[TensorDictBase]:
         """Yield batches as the losses read them; a few hundred are sampled in one go."""
-        low, high = self._bounds
         for first in range(0, updates, _AT_ONCE):
             count = min(_AT_ONCE, updates - first)
-            sample = self.buffer.sample(count * self.batch_size)
-            after: Any = sample["next"]
-            steps = TensorDict(
-                {
-                    "state": self.state.full(sample),
-                    "action": 2 * (sample["action"] - low) / (high - low) - 1,
-                    "next": {
-                        "state": self.state.full(after),
-                        **{key: after[key] for key in ("reward", "done", "terminated")},
-                    },
-                },
-                batch_size=sample.batch_size,
-            )
-            # relabelled ones come first in the sample
-            yield from steps[torch.randperm(len(steps))].split(self.batch_size)
+            with isolated(self.seed, "ddpg update", *key, first):
+                steps = self._steps(self.buffer.sample(count * self.batch_size))
+                # relabelled ones come first in the sample
+                batches: Any = steps[torch.randperm(len(steps))].split(self.batch_size)
+            yield from batches
+
+    def _steps(self, sample: TensorDictBase) -> TensorDictBase:
+        """Return a sample as the losses read it."""
+        low, high = self._bounds
+        after: Any = sample["next"]
+        action = 2 * (sample["action"] - low) / (high - low) - 1
+        entries = {
+            "state": self.state.full(sample),
+            "action": action,
+            "noise": torch.randn_like(action),  # of TD3's target actions
+            "next": {
+                "state": self.state.full(after),
+                **{key: after[key] for key in ("reward", "done", "terminated")},
+            },
+        }
+        return TensorDict(entries, batch_size=sample.batch_size)
 
     def _step(self, part: str, loss: Tensor) -> float:
         value = loss.item()
@@ -271,7 +312,7 @@ class DDPG:
         self._optimizers[part].step()
         return value
 
-    def _set_learning_rate(self, progress: float) -> float:
+    def _set_rate(self, progress: float) -> float:
         first, last, start = self._rates
         over = min(max((progress - start) / max(1 - start, 1e-9), 0.0), 1.0)
         rate = first + over * (last - first)
@@ -285,11 +326,16 @@ class DDPG:
         return [p for name, p in self._loss.named_parameters() if own in name and p.requires_grad]
 
     def state_dict(self) -> dict[str, Any]:
-        """Return networks, statistics, optimisers and replay buffer, for `load_state_dict`."""
+        """Return networks, statistics, optimisers and replay buffer, for `load_state_dict`.
+
+        Updates that are still owed are made before.
+        """
+        self.finish()
         return self._learned() | {"buffer": self.buffer.contents()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from ``state``."""
+        self._owed = None
         self._learn(state)
         self.buffer.restore(state["buffer"])
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 __all__ = ["BatchedMujocoEnv"]
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -152,6 +153,19 @@ class BatchedMujocoEnv(EnvBase):
             expected = "a task whose commands are its controls, to add to them every time step"
             raise ValueError(message(expected, drive))
         self._additions[key] = addition
+
+    @contextmanager
+    def meanwhile(self, work: Callable[[], None]) -> Iterator[None]:
+        """Let this thread ``work`` during each step within the block; other threads simulate it.
+
+        For a learner that improves from former episodes while the next ones come in. ``work`` must
+        not touch this environment.
+        """
+        self.stepper.meanwhile = work
+        try:
+            yield
+        finally:
+            self.stepper.meanwhile = None
 
     def open_loop(self, actions: Tensor) -> TensorDictBase:
         """Apply whole sequences of actions in one native call; nothing is reset on the way.

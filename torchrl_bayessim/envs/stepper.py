@@ -66,6 +66,7 @@ class Stepper:
         status: What became of each simulation in the last call that included it: 0, or
             `native.DIVERGED`, ``OVERFLOW`` or ``FAILED`` (which are errors too), shape ``(N,)``.
         command_size: Numbers in a command.
+        meanwhile: What this thread does during a rollout, in which others then step; None to step.
     """
 
     def __init__(
@@ -93,7 +94,8 @@ class Stepper:
         self._threads = threads or len(os.sched_getaffinity(0))
         self._hire = lambda: Worker(model, arrays)
         self._workers = [self._hire()]
-        self._pool = Threads(max(1, self._threads - 1))
+        self._pool = Threads(self._threads)
+        self.meanwhile: Callable[[], None] | None = None
         self._queue = np.zeros(1, dtype=np.int64)
         self._drive = resolved(model, drive, sites)
         self._sharing = sharing
@@ -201,7 +203,8 @@ class Stepper:
             raise ValueError(message(f"a sequence for each of {self.num_envs}", sequence.shape))
         _within(sequence[rows], len(commands), "sequences of commands")
         commands = np.asarray(commands, dtype=np.float64)
-        self._run(native.advance, rows, outputs, commands, sequence, substeps)
+        arguments = commands, sequence, substeps
+        self._run(native.advance, rows, outputs, *arguments, meanwhile=self.meanwhile)
         return outputs
 
     def _run(
@@ -210,8 +213,9 @@ class Stepper:
         rows: NDArray[np.int64],
         outputs: NDArray[np.float64],
         *arguments: object,
+        meanwhile: Callable[[], None] | None = None,
     ) -> None:
-        """Let all threads work through the rows, this one among them."""
+        """Let all threads work through the rows, this one among them if it has nothing to do."""
         self._queue[0] = 0
         batch = self.models.table, self._sharing, self.state, _SIGNATURE
         shared = self._drive, self._queue, rows, outputs, self.status, *arguments
@@ -221,10 +225,16 @@ class Stepper:
                 worker.addresses = self.models.addresses(worker.model)
             owned = worker.owned, worker.blocks, worker.addresses, worker.jacobian
             calls.append((owned, batch, *shared))
-        futures = [self._pool.submit(kernel, *call) for call in calls[1:]]
-        kernel(*calls[0])
-        for future in futures:
-            future.result()
+        own = calls[:1] if meanwhile is None else []
+        futures = [self._pool.submit(kernel, *call) for call in calls[len(own) :]]
+        try:
+            for call in own:
+                kernel(*call)
+            if meanwhile is not None:
+                meanwhile()
+        finally:  # they write to the states
+            for future in futures:
+                future.result()
         self._raise_failures(rows)
 
     def _raise_failures(self, rows: NDArray[np.int64]) -> None:
