@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
@@ -29,9 +29,9 @@ from .actor_critic_losses import BoundedDDPGLoss, BoundedTD3Loss, SoftUpdateAtOn
 from .goal_networks import GOAL_KEYS, Actor, Critic, GoalState, action_bounds, goal_policy
 from .hindsight import GoalReward, HindsightReplayBuffer
 from .owed_updates import OwedUpdates
+from .replayed_batches import ReplayedBatches
 
 _LOSSES = {"ddpg": BoundedDDPGLoss, "td3": BoundedTD3Loss}
-_AT_ONCE = 160  # batches sampled in one go
 
 
 class DDPG:
@@ -138,7 +138,7 @@ class DDPG:
                 message(f"a replay buffer of at least one batch of {batch_size}", capacity)
             )
         self.name = f"{algorithm.upper()}+HER"
-        self.seed, self.batch_size = seed, batch_size
+        self.batch_size = batch_size
         self.updates_per_frame, self._actor_every = updates_per_frame, 1 + (algorithm == "td3")
         self._rates = learning_rate, final_learning_rate, decay_from
         self.state = GoalState(env, critic_keys)
@@ -157,6 +157,9 @@ class DDPG:
         self.policy = goal_policy(env, self.state, actor, noise=noise, random_share=random_share)
         self.buffer = HindsightReplayBuffer(
             reward, capacity=capacity, share=relabelled, moving=moving
+        )
+        self._replayed = ReplayedBatches(
+            self.buffer, self.state, self._bounds, batch_size=batch_size, seed=seed
         )
         self._targets = SoftUpdateAtOnce(self._loss, tau=tau)
         self._owed: tuple[OwedUpdates, dict[str, Any]] | None = None
@@ -262,7 +265,7 @@ class DDPG:
     def _updates(self, count: int, key: tuple[int | str, ...]) -> Iterator[None]:
         """Make an update at each turn; the report has the means of their losses."""
         sums = {"actor": 0.0, "critic": 0.0}
-        for index, steps in enumerate(self._replayed(count, key)):
+        for index, steps in enumerate(self._replayed(count, key=key)):
             sums["critic"] += self._step("critic", self._loss.critic_loss(steps))
             if (index + 1) % self._actor_every == 0:
                 sums["actor"] += self._step("actor", self._loss.policy_loss(steps))
@@ -270,32 +273,6 @@ class DDPG:
             made = {"actor": (index + 1) // self._actor_every, "critic": index + 1}
             self._report |= {f"loss_{part}": sums[part] / max(1, made[part]) for part in sums}
             yield
-
-    def _replayed(self, updates: int, key: tuple[int | str, ...]) -> Iterator[TensorDictBase]:
-        """Yield batches as the losses read them; a few hundred are sampled in one go."""
-        for first in range(0, updates, _AT_ONCE):
-            count = min(_AT_ONCE, updates - first)
-            with isolated(self.seed, "ddpg update", *key, first):
-                steps = self._steps(self.buffer.sample(count * self.batch_size))
-                # relabelled ones come first in the sample
-                batches: Any = steps[torch.randperm(len(steps))].split(self.batch_size)
-            yield from batches
-
-    def _steps(self, sample: TensorDictBase) -> TensorDictBase:
-        """Return a sample as the losses read it."""
-        low, high = self._bounds
-        after: Any = sample["next"]
-        action = 2 * (sample["action"] - low) / (high - low) - 1
-        entries = {
-            "state": self.state.full(sample),
-            "action": action,
-            "noise": torch.randn_like(action),  # of TD3's target actions
-            "next": {
-                "state": self.state.full(after),
-                **{key: after[key] for key in ("reward", "done", "terminated")},
-            },
-        }
-        return TensorDict(entries, batch_size=sample.batch_size)
 
     def _step(self, part: str, loss: Tensor) -> float:
         value = loss.item()
