@@ -127,11 +127,11 @@ def _chunk(
         batch = batch.reshape(-1, batch.shape[-1])
         progress = index / plan.batches if plan.decays else 0.0
         last = state["curve"][-1] if state["curve"] else {}
-        last |= learning.update(batch, key=(*key, index), progress=progress)
         point = {"frames": last.get("frames", 0.0) + batch.numel(), "return": ended_return(batch)}
+        learning.update(batch, into=point, key=(*key, index), progress=progress)
         due = (index + 1) % plan.score_every == 0 or index + 1 == plan.batches
         if due or index + 1 == until:
-            point |= learning.finish()
+            learning.finish()
         point["seconds"] = last.get("seconds", 0.0) + time.monotonic() - wall
         point["cpu_seconds"] = last.get("cpu_seconds", 0.0) + time.process_time() - cpu
         if score is not None and due:

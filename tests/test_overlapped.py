@@ -38,11 +38,19 @@ def test_work_is_done_at_every_step_and_changes_no_batch(wrap, threads):
     assert torch.equal(batch["observation"], collected(reach())["observation"])
 
 
-def test_other_environments_leave_no_time():
+def test_in_other_environments_all_is_done_before_the_first_step():
     shares = []
     env = SerialEnv(2, lambda: GymEnv("Pendulum-v1"))
     collected(env, meanwhile=shares.append)
-    assert not shares
+    assert shares == [1.0]
+
+
+def test_a_step_with_additions_is_one_step():
+    shares = []
+    env = BatchedMujocoEnv("Hopper-v5", 2, threads=1)
+    env.add("push", lambda now: {})
+    collected(env, meanwhile=shares.append)
+    assert shares == pytest.approx(np.arange(1, STEPS + 1) / STEPS)
 
 
 def test_an_environment_steps_for_itself_again_after_an_error():
@@ -55,7 +63,7 @@ def test_an_environment_steps_for_itself_again_after_an_error():
 
     with pytest.raises(OSError, match="no more"), env.meanwhile(fail):
         env.step(td)
-    assert env.stepper.meanwhile is None
+    assert env._work is None
     assert env.step(td)["next", "observation"].isfinite().all()
 
 
@@ -65,31 +73,31 @@ def overlapping(batches):
     learner = DDPG(env, goal_reward, **SMALL)
     learning = Overlapped(learner)
     collector = make_collector(env, learner.policy, steps=STEPS)
-    reports = []
-    for index in range(batches):
+    reports = [{} for _ in range(batches)]
+    for index, report in enumerate(reports):
         with isolated(index):
             batch = next_batch(collector, meanwhile=learning.meanwhile)
-        reports.append(learning.update(batch, key=(index,)))
-    reports.append(learning.finish())
+        learning.update(batch, into=report, key=(index,))
+        assert not report
+    learning.finish()
     return learner._tensors(), reports
 
 
 def test_no_clock_decides_what_is_learned():
     (tensors, reports), (twins, others) = overlapping(3), overlapping(3)
     assert reports == others
-    assert reports[0] == {}
-    assert [report["updates"] for report in reports[1:]] == [20.0] * 3
+    assert [report["updates"] for report in reports] == [20.0] * 3
     assert all(torch.equal(tensors[name], twins[name]) for name in tensors)
 
 
-def test_a_learner_that_cannot_learns_at_once_and_is_reported_late():
+def test_a_learner_that_cannot_learns_at_once():
     class Learner:
         def update(self, batch, *, key):
             return {"loss": float(batch + key)}
 
     learning = Overlapped(Learner())
     assert learning.meanwhile is None
-    assert learning.update(1, key=1) == {}
-    assert learning.update(2, key=2) == {"loss": 2.0}
-    assert learning.finish() == {"loss": 4.0}
-    assert learning.finish() == {}
+    report = {"frames": 8.0}
+    learning.update(1, into=report, key=1)
+    learning.finish()
+    assert report == {"frames": 8.0, "loss": 2.0}

@@ -97,6 +97,8 @@ class EvidenceSimulator:
         ``meanwhile``: See `next_batch`.
         """
         if self.collectors is not None:
+            if meanwhile is not None:
+                meanwhile(1.0)
             return self.collectors.batch(self.policy)
         with isolated(*key):
             batch = next_batch(self.collector, meanwhile=meanwhile)

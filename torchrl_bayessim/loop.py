@@ -60,7 +60,9 @@ from .transforms.domain_randomizer import DomainRandomizer
 class Learner(Protocol):
     """What the loop asks of an agent: a policy, and a way to improve it from batches.
 
-    If it has ``settings``, a dictionary of plain values, a checkpoint of others is refused.
+    If it has ``settings``, a dictionary of plain values, a checkpoint of others is refused. If it
+    has ``begin``, ``work`` and ``finish`` they are used in the place of ``update``, to learn while
+    the next batch is collected: see :mod:`.overlapped`.
     """
 
     policy: TensorDictModuleBase
@@ -320,7 +322,7 @@ class SimToRealLoop:
         state["fit"] = dataclasses.asdict(report)
         if shared:  # collected with this very policy: the learner's first update of the round
             self._update(concatenate(shared))
-            self._finish()
+            self._overlapped.finish()
 
     def _train(self) -> None:
         state = self._state
@@ -332,7 +334,7 @@ class SimToRealLoop:
         for update in tqdm(range(first, last), desc=label, disable=not self.progress, leave=False):
             meanwhile = self._overlapped.meanwhile
             self._update(self._simulator.batch((*key, update), meanwhile=meanwhile))
-        self._finish()
+        self._overlapped.finish()
         state["update"] = last
 
     def _update(self, batch: TensorDictBase) -> None:
@@ -342,21 +344,12 @@ class SimToRealLoop:
         key = (self.seed, "round", state["round"], "update", len(state["curve"]))
         seen = [*self.learner.policy.in_keys, "reward"]
         usable, dropped = finite_rows(batch, [*seen, *map(next_key, seen)])
-        self._tell(self._overlapped.update(usable, key=key, progress=done / planned))
+        entry = {"frames": float(state["frames"] + batch.numel()), "return": ended_return(usable)}
+        self._overlapped.update(usable, into=entry, key=key, progress=done / planned)
         state["frames"] += batch.numel()
-        entry = {"frames": float(state["frames"]), "return": ended_return(usable)}
         if dropped:
             entry["dropped"] = float(dropped)
         state["curve"] = [*state["curve"], entry]
-
-    def _finish(self) -> None:
-        self._tell(self._overlapped.finish())
-
-    def _tell(self, reported: Mapping[str, float]) -> None:
-        """Add to the last entry of the curve what the learner reports of it."""
-        if reported:
-            *earlier, last = self._state["curve"]
-            self._state["curve"] = [*earlier, {**last, **reported}]
 
     # Keeping work.
 
@@ -379,7 +372,7 @@ class SimToRealLoop:
         """
         check_kind("the state of a loop", state, Mapping)
         state = dict(state)
-        missing = [name for name in self.state_dict() if name not in state]
+        missing = [name for name in _STATE if name not in state]
         if missing:
             expected = "the state of a loop, with an entry"
             raise ValueError(message(expected, f"none {missing[0]!r}", available=state))
@@ -392,7 +385,7 @@ class SimToRealLoop:
                         hint="the settings of the run that wrote it, or a new run",
                     )
                 )
-        self._state = dict(state["loop"])
+        self._state, self._overlapped = dict(state["loop"]), Overlapped(self.learner)
         self.learner.load_state_dict(state["learner"])
         self.refinement.load_state_dict(state["refinement"])
         self.randomizer.set_extra_state(dict(state["randomizer"]))
@@ -409,6 +402,7 @@ class SimToRealLoop:
             checkpoint.save(self.checkpoint_file, self.state_dict())
 
 
+_STATE = "loop", "learner", "refinement", "randomizer", "settings"  # what a checkpoint holds
 _FRESH: dict[str, Any] = {"real": None, "fit": None, "update": 0, "curve": [], "seconds": 0.0}
 
 

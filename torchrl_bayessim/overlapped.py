@@ -13,12 +13,12 @@ from tensordict import TensorDictBase
 class Overlapped:
     """Hands batches to a learner and leaves the time of collecting to it.
 
-    Off-policy learners can use it, those with ``begin``, ``work`` and ``finish`` such as
-    :class:`.agents.ddpg.DDPG`; others learn at once. Either way a report comes one batch late. The
-    policy changes while it collects, by updates that no clock decides: same seed, same numbers.
+    Off-policy learners can use it, those that have ``begin``, ``work`` and ``finish`` besides
+    ``update``, such as :class:`.agents.ddpg.DDPG`; others learn at once. The policy then changes
+    while it collects, by updates that no clock decides: same seed, same numbers.
 
     Args:
-        learner: Has ``update``, or all three.
+        learner: Has ``update``, and the other three if it can.
 
     Attributes:
         meanwhile: For `next_batch`; None if the learner cannot use the time.
@@ -26,22 +26,21 @@ class Overlapped:
 
     def __init__(self, learner: Any) -> None:
         self._learner = learner
-        self._reported: dict[str, float] = {}
+        self._into: dict[str, float] | None = None
         able = all(hasattr(learner, name) for name in ("begin", "work", "finish"))
         self.meanwhile: Callable[[float], None] | None = learner.work if able else None
 
-    def update(self, batch: TensorDictBase, **options: Any) -> dict[str, float]:
-        """Hand over a batch; return the report on the one before, empty for the first."""
-        reported = self.finish()
+    def update(self, batch: TensorDictBase, *, into: dict[str, float], **options: Any) -> None:
+        """Hand over a batch, after the last one is used up; the report on it goes ``into``."""
+        self.finish()
         if self.meanwhile is None:
-            self._reported = self._learner.update(batch, **options)
-        else:
-            self._learner.begin(batch, **options)
-        return reported
+            into.update(self._learner.update(batch, **options))
+            return
+        self._learner.begin(batch, **options)
+        self._into = into
 
-    def finish(self) -> dict[str, float]:
-        """Let the learner use the last batch up, and return the report on it."""
-        if self.meanwhile is not None:
-            return self._learner.finish()
-        reported, self._reported = self._reported, {}
-        return reported
+    def finish(self) -> None:
+        """Let the learner use the last batch up; what `update` reports of it is there then."""
+        if self._into is not None:
+            into, self._into = self._into, None
+            into.update(self._learner.finish())

@@ -27,7 +27,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import BaseCollector, Collector
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
 from .counts import check_count
 from .diverged import UndisturbedPolicy, check_policy
@@ -82,8 +82,8 @@ def next_batch(
     Args:
         collector: Collects.
         meanwhile: Called in this thread during every step that a batched environment simulates in
-            others, with the share of the batch's steps that have begun. Never called where the
-            environment is of another kind. It does not fail.
+            others, with the share of the batch's steps that have begun; of another environment,
+            once with 1 before the first step. It does not fail.
 
     Raises:
         SimulationError: The collector failed, for instance because a policy was given NaN.
@@ -104,9 +104,14 @@ def next_batch(
 
 @contextmanager
 def _working(collector: Any, meanwhile: Callable[[float], None] | None) -> Iterator[None]:
+    if meanwhile is None:
+        yield
+        return
     env = getattr(collector, "env", None)
-    env = getattr(env, "base_env", env)
-    if meanwhile is None or not isinstance(env, BatchedMujocoEnv):
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    if not isinstance(env, BatchedMujocoEnv):
+        meanwhile(1.0)
         yield
         return
     steps = collector.requested_frames_per_batch // env.batch_size.numel()

@@ -3,8 +3,9 @@
 Both collect episodes with DDPG's exploring policy and TorchRL's collector, draw a new friction for
 each episode, fill the hindsight replay buffer, and make as many gradient updates per frame; one
 steps 16 environments natively, the other a ``SerialEnv`` of 16 gymnasium environments. They take
-turns, so ratios are within a run. ``collect`` is the loop without its updates, ``train`` the whole
-of it; environment frames per second. ``updates=0.2`` (per frame) is the recipe's setting::
+turns, so ratios are within a run. While the native one steps in a thread of its own the learner
+makes its updates; Python simulators leave it no time. ``collect`` is the loop without its updates,
+``train`` the whole of it; environment frames per second. ``updates=0.2`` (per frame) is the recipe's setting::
 
     python recipes/benchmarks/fetch_training.py [task=FetchPush-v4] [runs=5] [updates=0.2]
         [matmul_precision=medium]
@@ -68,7 +69,7 @@ def loop(env: EnvBase, updates: float, batches: int) -> Callable[[], int]:
             with isolated(index):
                 batch: Any = next_batch(collector, meanwhile=learning.meanwhile)
             if updates:
-                learning.update(batch, key=(index,))
+                learning.update(batch, into={}, key=(index,))
             else:
                 learner.buffer.extend(batch.select(*learner.kept_keys))
         return batches * frames

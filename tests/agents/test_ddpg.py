@@ -7,6 +7,7 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_bayessim.agents.ddpg import DDPG
+from torchrl_bayessim.agents.goal_networks import _multiplies
 from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.envs.tasks.fetch import goal_reward
@@ -193,6 +194,22 @@ def test_a_failure_in_the_midst_is_told_at_the_end_and_undone(episodes):
     assert not changed(before, learner._tensors())
 
 
+def test_after_an_interrupt_the_rest_is_forgone(episodes, monkeypatch):
+    learner = DDPG(push(), goal_reward, **SMALL)
+    learner.begin(episodes, key=(0,))
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(learner._targets, "step", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            learner.work(0.5)
+    with torch.no_grad():
+        learner.state_dict()
+    assert learner.update(episodes, key=(1,))["updates"] == 10
+
+
 def test_a_checkpoint_owes_nothing(episodes):
     learner, twin = (DDPG(push(), goal_reward, **SMALL) for _ in range(2))
     learner.begin(episodes, key=(0,))
@@ -216,6 +233,7 @@ def test_hidden_layers_in_bfloat16_change_little(episodes):
         torch.set_float32_matmul_precision(precision)
     assert rounded.dtype == torch.float32
     assert (rounded - exact).norm() < 0.02 * exact.norm()
+    assert torch.equal(rounded, exact) != _multiplies()
 
 
 def test_the_learning_rate_is_constant_and_then_falls(episodes):

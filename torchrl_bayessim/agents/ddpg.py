@@ -214,7 +214,8 @@ class DDPG:
             )
         self.state.observe(kept)
         updates = round(self.updates_per_frame * batch.numel())
-        self._report = {"updates": float(updates), "learning_rate": self._set_rate(progress)}
+        self._report = {"loss_actor": 0.0, "loss_critic": 0.0, "updates": float(updates)}
+        self._report["learning_rate"] = self._set_rate(progress)
         self._owed = OwedUpdates(self._updates(updates, tuple(key)), updates), before
 
     def work(self, share: float) -> None:
@@ -223,7 +224,7 @@ class DDPG:
         They draw nothing from global generators, so this may happen in the midst of what does.
         """
         if self._owed is not None:
-            with torch.enable_grad():  # collectors forbid gradients
+            with torch.enable_grad():  # which collectors switch off
                 self._owed[0].work(share)
 
     def finish(self) -> dict[str, float]:
@@ -236,7 +237,8 @@ class DDPG:
             return {}
         (owed, before), self._owed = self._owed, None
         try:
-            owed.finish()
+            with torch.enable_grad():
+                owed.finish()
         except SimulationError:
             self._learn(before)
             raise

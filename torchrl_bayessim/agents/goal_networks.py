@@ -5,6 +5,7 @@ from __future__ import annotations
 __all__ = ["GOAL_KEYS", "Actor", "Critic", "GoalState", "action_bounds", "goal_policy"]
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
@@ -178,15 +179,18 @@ class _ReLUNetwork(nn.Sequential):
 
     def forward(self, x: Tensor) -> Tensor:
         *hidden, last = self
-        short = torch.get_float32_matmul_precision() == "medium" and _multiplies_bfloat16()
-        with torch.autocast(x.device.type, torch.bfloat16, enabled=short):
+        dtype = x.dtype
+        medium = torch.get_float32_matmul_precision() == "medium"
+        short = medium and dtype == torch.float32 and x.device.type == "cpu"
+        with torch.autocast("cpu", torch.bfloat16) if short and _multiplies() else nullcontext():
             for layer in hidden:
                 x = layer(x)
-        return last(x.float())
+        return last(x.to(dtype))
 
 
 @lru_cache
-def _multiplies_bfloat16() -> bool:
+def _multiplies() -> bool:
+    """Return whether this processor multiplies numbers in bfloat16."""
     known = getattr(torch.cpu, "get_capabilities", dict)()  # torch 2.11 has none
     return any(known.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))
 

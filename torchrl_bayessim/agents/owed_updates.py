@@ -35,7 +35,7 @@ class OwedUpdates:
         """Make updates until this share of them is made; `finish` tells of a failure."""
         while self._failure is None and self._made < round(min(share, 1.0) * self._count):
             try:
-                next(self._updates)
+                next(self._updates, None)  # an interrupt ends them
             except Exception as error:
                 self._failure = error
             self._made += 1

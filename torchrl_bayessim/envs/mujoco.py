@@ -86,6 +86,7 @@ class BatchedMujocoEnv(EnvBase):
             threads=threads,
         )
         self._additions: dict[object, Addition] = {}
+        self._work: Callable[[], None] | None = None
         self._seed = 0 if seed is None else int(seed)
         self._episodes = np.zeros(num_envs, dtype=np.int64)
         self._elapsed = torch.zeros(num_envs, 1, dtype=torch.int64)
@@ -156,16 +157,16 @@ class BatchedMujocoEnv(EnvBase):
 
     @contextmanager
     def meanwhile(self, work: Callable[[], None]) -> Iterator[None]:
-        """Let this thread ``work`` during each step within the block; other threads simulate it.
+        """Let this thread ``work`` once in each step within the block; other threads simulate it.
 
         For a learner that improves from former episodes while the next ones come in. ``work`` must
-        not touch this environment.
+        not touch this environment. Where an `Addition` needs this thread, it works before the step.
         """
-        self.stepper.meanwhile = work
+        before, self._work = self._work, work
         try:
             yield
         finally:
-            self.stepper.meanwhile = None
+            self._work = before
 
     def open_loop(self, actions: Tensor) -> TensorDictBase:
         """Apply whole sequences of actions in one native call; nothing is reset on the way.
@@ -233,7 +234,10 @@ class BatchedMujocoEnv(EnvBase):
         substeps = self.task.frame_skip
         self._time()
         if not self._additions:
-            return self.stepper.rollout(commands, substeps=substeps, outputs=outputs)
+            options = {"substeps": substeps, "outputs": outputs}
+            return self.stepper.rollout(commands, meanwhile=self._work, **options)
+        if self._work is not None:
+            self._work()
         added = rollout_with(self.stepper, self._additions.values(), commands, substeps=substeps)
         if outputs is not None:
             outputs[:] = added

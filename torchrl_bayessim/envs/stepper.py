@@ -12,6 +12,7 @@ __all__ = ["Stepper"]
 
 import os
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 
 import mujoco
 import numpy as np
@@ -66,7 +67,6 @@ class Stepper:
         status: What became of each simulation in the last call that included it: 0, or
             `native.DIVERGED`, ``OVERFLOW`` or ``FAILED`` (which are errors too), shape ``(N,)``.
         command_size: Numbers in a command.
-        meanwhile: What this thread does during a rollout, in which others then step; None to step.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Stepper:
         self._hire = lambda: Worker(model, arrays)
         self._workers = [self._hire()]
         self._pool = Threads(self._threads)
-        self.meanwhile: Callable[[], None] | None = None
+        self._running: list[Future[None]] = []
         self._queue = np.zeros(1, dtype=np.int64)
         self._drive = resolved(model, drive, sites)
         self._sharing = sharing
@@ -170,6 +170,7 @@ class Stepper:
         sequence: NDArray[np.int64] | None = None,
         rows: NDArray[np.int64] | None = None,
         outputs: NDArray[np.float64] | None = None,
+        meanwhile: Callable[[], None] | None = None,
     ) -> NDArray[np.float64]:
         """Apply sequences of commands, each held for ``substeps`` steps.
 
@@ -180,6 +181,7 @@ class Stepper:
                 its own.
             rows: Which simulations to advance; default all.
             outputs: Where to write; default a new array.
+            meanwhile: What this thread does while others step; None to step with them.
 
         Returns:
             The outputs after each command, shape ``(N, T, M)``: NaN after a divergence, anything in
@@ -204,7 +206,7 @@ class Stepper:
         _within(sequence[rows], len(commands), "sequences of commands")
         commands = np.asarray(commands, dtype=np.float64)
         arguments = commands, sequence, substeps
-        self._run(native.advance, rows, outputs, *arguments, meanwhile=self.meanwhile)
+        self._run(native.advance, rows, outputs, *arguments, meanwhile=meanwhile)
         return outputs
 
     def _run(
@@ -216,6 +218,7 @@ class Stepper:
         meanwhile: Callable[[], None] | None = None,
     ) -> None:
         """Let all threads work through the rows, this one among them if it has nothing to do."""
+        wait(self._running)  # after an interrupt
         self._queue[0] = 0
         batch = self.models.table, self._sharing, self.state, _SIGNATURE
         shared = self._drive, self._queue, rows, outputs, self.status, *arguments
@@ -226,15 +229,16 @@ class Stepper:
             owned = worker.owned, worker.blocks, worker.addresses, worker.jacobian
             calls.append((owned, batch, *shared))
         own = calls[:1] if meanwhile is None else []
-        futures = [self._pool.submit(kernel, *call) for call in calls[len(own) :]]
+        self._running = [self._pool.submit(kernel, *call) for call in calls[len(own) :]]
         try:
             for call in own:
                 kernel(*call)
             if meanwhile is not None:
                 meanwhile()
         finally:  # they write to the states
-            for future in futures:
-                future.result()
+            wait(self._running)
+        for future in self._running:
+            future.result()
         self._raise_failures(rows)
 
     def _raise_failures(self, rows: NDArray[np.int64]) -> None:
