@@ -5,7 +5,8 @@ each episode, fill the hindsight replay buffer, and make as many gradient update
 steps 16 environments natively, the other a ``SerialEnv`` of 16 gymnasium environments. They take
 turns, so ratios are within a run. While the native one steps in a thread of its own the learner
 makes its updates; Python simulators leave it no time. ``collect`` is the loop without its updates,
-``train`` the whole of it; environment frames per second. ``updates=0.2`` (per frame) is the recipe's setting::
+``train`` the whole of it; environment frames per second. ``updates=0.2`` (per frame) is the
+recipe's setting::
 
     python recipes/benchmarks/fetch_training.py [task=FetchPush-v4] [runs=5] [updates=0.2]
         [matmul_precision=medium]

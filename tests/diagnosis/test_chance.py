@@ -101,8 +101,9 @@ def test_an_estimated_velocity_is_estimated_from_bridged_positions():
     (log,) = logs(1)
     log = held(replace(log, velocity_gain=torch.ones(1).double()), 0.2, np.random.default_rng(0),
                "qpos")  # fmt: skip
-    ((bridge,), (hold,)) = bridged([log], system().robot)
+    (bridge,), (hold,), alarms = bridged([log], system().robot)
     assert hold.share == pytest.approx(0.2, abs=0.06)
+    assert not alarms
     assert not torch.equal(bridge.qvel, log.qvel)
     assert float((bridge.qvel - log.qvel).abs().median()) < 0.3
 

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from apparatus import arm, arm_task
+from apparatus import ARM, arm, arm_task
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -216,6 +216,28 @@ def test_a_motor_loses_torque_with_speed_where_it_drives_only():
     assert added[0] == pytest.approx((1.2 - 0.7 - 1.0) * 2.0)
     assert forces("torque_speed_limit", 1.0, qvel=-fast, ctrl=full)["ctrl"][0] == 0.0
     assert forces("torque_speed_limit", 1.0, qvel=0.0, ctrl=full)["ctrl"] == [0.0] * 3
+
+
+@pytest.mark.parametrize("beyond", [2.0, 3.0, 50.0])
+def test_a_motor_that_is_asked_for_more_than_it_has_loses_no_less(beyond):
+    fast = 0.7 * arm().velocity_scale[0].item()
+    added = forces("torque_speed_limit", 1.0, qvel=fast, ctrl=(beyond, 0.0, 0.0))["ctrl"]
+    assert beyond + added[0] == pytest.approx((1.2 - 0.7) * 2.0)
+    assert law_over_time("backlash", 0.02, [beyond, -beyond, -beyond])[1:] == [0.0, 0.0]
+
+
+def test_a_servo_at_its_largest_force_loses_torque_with_speed():
+    limited = ARM.replace('kp="5"', 'kp="5" forcerange="-1 1"')
+    robot = robot_of(Task(model=mujoco.MjModel.from_xml_string(limited), frame_skip=5))
+    zero, speed = torch.zeros(4).double(), torch.zeros(4).double()
+    speed[1] = 0.7 * robot.velocity_scale[1]
+    state = Readings(
+        qpos=zero, qvel=speed, ctrl=torch.tensor([0.0, 2.0, 0.0]).double(), time=zero[:1]
+    )
+    active = [(effect("torque_speed_limit"), torch.ones(3).double())]
+    forcing = Forcing(robot)
+    added, _ = forcing(active, forcing.start(active, state), state)
+    assert 5.0 * (2.0 + added["ctrl"][1].item()) == pytest.approx(1.2 - 0.7)
 
 
 def law_over_time(name, strength, commands, **options):

@@ -41,6 +41,17 @@ def test_csv(write, pendulum):
     assert log.velocity_gain.tolist() == [0.0]
 
 
+def test_files_of_one_name_are_told_apart(write, tmp_path, pendulum):
+    for folder in ("monday", "tuesday"):
+        (tmp_path / folder).mkdir()
+        write(ROWS, f"{folder}/run.csv")
+    files = [tmp_path / "monday" / "run.csv", tmp_path / "tuesday" / "run.csv"]
+    names = [record.name for record in read_records(files, pendulum)]
+    assert names == [str(file) for file in files]
+    with pytest.raises(ValueError, match=r"each file once, got '.*run\.csv twice'"):
+        read_records([files[0], str(files[0])], pendulum)
+
+
 def test_a_folder_is_read_in_order(write, tmp_path, pendulum):
     write(ROWS, "b.csv")
     write(ROWS, "a.csv")

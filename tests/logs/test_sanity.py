@@ -242,6 +242,7 @@ DEGREES = 180 / np.pi
         (lambda r: times(r, factor_v=-1), "velocity_sign"),
         (lambda r: times(r, factor_u=-1), "action_sign"),
         (lambda r: replace(r, time=1e3 * r.time), "time_unit"),
+        (lambda r: replace(r, time=1e3 * r.time / 12), "time_unit"),  # of a logger that is faster
     ],
 )
 def test_units_and_signs(change, kind):

@@ -147,7 +147,8 @@ def _points(selection: Selection) -> dict[str, Point]:
 def _absorbed(parameters: Sequence[Parameter]) -> list[str]:
     return [
         f"{p.name} was fitted to {p.without_effects:.3g}, at the edge of its prior "
-        f"[{p.prior[0]:.3g}, {p.prior[1]:.3g}]: an effect is being absorbed by parameters"
+        f"[{p.prior[0]:.3g}, {p.prior[1]:.3g}]: an effect is being absorbed by parameters, or the "
+        "prior is too narrow"
         for p in parameters
         if p.at_bound
     ]

@@ -6,6 +6,7 @@ __all__ = ["diagnose"]
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -79,8 +80,8 @@ def diagnose(
     Raises:
         TypeError: The simulator, the prior, a log or an effect is of another kind.
         ValueError: There are no logs, none is long enough, one is of another robot or control
-            step, not finite or not in order, an effect is asked for twice, or there is no such
-            mode.
+            step, of other columns, not finite or not in order, an effect is asked for twice, there
+            is no such mode, or the simulator's actuators have dynamics of their own.
         KeyError: An effect is not in the catalogue.
     """
     begun = time.perf_counter()
@@ -93,6 +94,7 @@ def diagnose(
     check_kind("a sequence of logs", logs, list, tuple)
     check_kind("a sequence of findings", findings, list, tuple)
     system = _system(simulator, prior)
+    _check_actuators(system)
     for log in logs:
         _check_log(log, system)
     chosen = _effects(system, effects, logs)
@@ -104,8 +106,11 @@ def diagnose(
     # many small matrices: threads of their own cost more than they bring
     with threadpool_limits(1, user_api="blas"):
         progress("fitting the parameters")
-        bridges, holds = bridged(logs, system.robot) if _asks_for_holds(every) else (logs, [])
-        prepared = prepare(system, bridges, units, generator=generator, mode=told, horizon=horizon)
+        asked = _asks_for_holds(every)
+        bridges, holds, slow = bridged(logs, system.robot) if asked else (logs, [], [])
+        prepared = prepare(
+            system, bridges, units, generator=generator, mode=told, horizon=horizon
+        ).alarmed(*slow)
         shapes = partial(_shapes, system, prepared, units)
         units = with_shapes(units, shapes(prepared.nominal.point))
         units = with_onsets(prepared.sets["train"], prepared.nominal.point, units)
@@ -149,6 +154,24 @@ def diagnose(
         )
 
 
+def _check_actuators(system: System) -> None:
+    """Refuse activations: a segment starts in a measured state, and no log measures those."""
+    model = system.task.model
+    if model.na:
+        moved = [
+            name
+            for name, kind in zip(system.robot.actuators, model.actuator_dyntype, strict=True)
+            if kind
+        ]
+        raise ValueError(
+            message(
+                "actuators without dynamics of their own (logs do not hold their activations)",
+                f"{model.na} activations, of {', '.join(moved)}",
+                hint="actuators without timeconst or dyntype, and the effect action_lag for them",
+            )
+        )
+
+
 def _check_log(log: Log, system: System) -> None:
     check_kind("a Log, as read_logs gives", log, Log)
     hint = "read_logs(source, system) with this system"
@@ -168,6 +191,11 @@ def _check_log(log: Log, system: System) -> None:
         if value.shape != size:
             expected = f"logs of this simulator, {name} of shape {size}"
             raise ValueError(message(expected, f"{tuple(value.shape)} in {log.name}", hint=hint))
+    measured = np.flatnonzero(log.measured.numpy()).tolist()
+    if measured != sorted(system.channel_index):
+        expected = f"logs in which {', '.join(system.robot.channels)} were measured"
+        got = f"{len(measured)} measured coordinates in {log.name}"
+        raise ValueError(message(expected, got, hint=hint))
         if name != "measured" and not value.is_floating_point():
             expected = f"{name} of {log.name} in floating-point numbers"
             raise TypeError(message(expected, str(value.dtype), hint=hint))
@@ -211,7 +239,8 @@ def _system(simulator: str | Task | System, prior: BoxPrior | None) -> System:
             raise ValueError(message(expected, "the system's and another", hint="pass None"))
         if prior is None:
             return simulator
-        simulator = simulator.task
+        check_kind("a BoxPrior or None", prior, BoxPrior)
+        return replace(simulator, physics=MujocoPhysics(*prior.names), prior=prior)
     task = as_task(simulator)
     if prior is not None:
         check_kind("a BoxPrior or None", prior, BoxPrior)

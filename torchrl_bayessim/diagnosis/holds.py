@@ -25,6 +25,7 @@ from ..logs.velocity import Windows, velocity
 _LEAST, _ROWS = 0.01, 10  # share of the rows, and rows, that are no accident
 _MOST = 0.6  # share beyond which the channel is sampled more slowly
 _MOVING = 0.2  # of the mean change: what a moving joint's neighbouring samples differ by
+_EQUAL = 0.3  # of the variance by chance
 _LONGEST = 12  # rows: a sample that stands still for longer is of a robot that does
 
 
@@ -43,14 +44,16 @@ class Hold:
     error: float
 
 
-def bridged(logs: Sequence[Log], robot: Robot) -> tuple[list[Log], list[Hold]]:
+def bridged(logs: Sequence[Log], robot: Robot) -> tuple[list[Log], list[Hold], list[str]]:
     """Return the logs with held samples replaced by straight lines, and the channels concerned.
+
+    And an alarm for each that only is slower than the log: it is renewed in equal intervals.
 
     Args:
         logs: As recorded.
         robot: Its channels; those of hinges and slides are looked at.
     """
-    found, result = [], list(logs)
+    found, alarms, result = [], [], list(logs)
     for number, channel in enumerate(robot.channels):
         joint, kind = robot.channel_joint[number], robot.channel_kind[number]
         if joint < 0 or kind not in {"position", "velocity"}:
@@ -64,7 +67,13 @@ def bridged(logs: Sequence[Log], robot: Robot) -> tuple[list[Log], list[Hold]]:
         moving = sum(_moving(column, h) for column, h in zip(columns, held, strict=True))
         if moving < max(_ROWS, _LEAST * count) or share > _MOST:
             continue
-        found.append(Hold(channel, share, float(np.sqrt(share * (1 - share) / count))))
+        if _regular(held, share):
+            alarms.append(
+                f"{channel} is renewed every {1 / (1 - share):.2g} rows: between them it was taken "
+                "to go straight"
+            )
+        else:
+            found.append(Hold(channel, share, float(np.sqrt(share * (1 - share) / count))))
         result = [
             _replaced(log, name, index, h) if h.any() else log
             for log, h in zip(result, held, strict=True)
@@ -72,7 +81,19 @@ def bridged(logs: Sequence[Log], robot: Robot) -> tuple[list[Log], list[Hold]]:
         if kind == "position":
             dof = robot.dof_index[joint]
             result = [_slope(log, index, dof) for log in result]
-    return result, found
+    return result, found, alarms
+
+
+def _regular(held: Sequence[NDArray[np.bool_]], share: float) -> bool:
+    """Return whether samples are renewed in intervals more equal than chance makes them.
+
+    >>> every_other = np.arange(400) % 2 == 1
+    >>> _regular([every_other], 0.5), _regular([np.random.default_rng(0).random(400) < 0.5], 0.5)
+    (True, False)
+    """
+    intervals = np.concatenate([np.diff(np.flatnonzero(~h)) for h in held])
+    by_chance = share / (1 - share) ** 2  # of a geometric distribution
+    return len(intervals) > 1 and float(intervals.var()) < _EQUAL * by_chance
 
 
 def _held(values: NDArray[np.float64]) -> NDArray[np.bool_]:

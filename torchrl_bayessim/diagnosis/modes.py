@@ -144,10 +144,9 @@ class Trajectories(Mode):
 
     def cut(self, logs: Sequence[Log], horizon: int, *, history: int, most: int) -> Segments:
         """Return at most so many windows, the first from the first row on."""
-        long = [log for log in logs if len(log) > horizon]
         channels = int(logs[0].measured.sum())
         checks = max(10, _COMPARED // channels)
-        return cut(long, horizon, history=history, most=most, checks=checks)
+        return cut(logs, horizon, history=history, most=most, checks=checks)
 
 
 class Summaries(Mode):

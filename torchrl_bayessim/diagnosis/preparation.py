@@ -40,6 +40,7 @@ _MANY = 60  # segments on which they are
 _FEW = 8  # segments on which the parameters are fitted first
 _PIECE = 0.25  # of the median log's length, below which it is a piece of one
 _AS_LONG = 1.25  # ratio of two lengths that count as one
+_APART = 3  # runs from which each split has one of its own
 _DEAL = "train", "test", "validation", "train", "train", "test", "validation", "train"
 
 
@@ -74,9 +75,9 @@ class Prepared:
         """Names of the logs of each split."""
         return {name: tuple(log.name for log in part) for name, part in self.logs.items()}
 
-    def alarmed(self, alarm: str) -> Prepared:
-        """Return the same with one more thing that the reader must know."""
-        return replace(self, alarms=(*self.alarms, alarm))
+    def alarmed(self, *alarms: str) -> Prepared:
+        """Return the same with more that the reader must know."""
+        return replace(self, alarms=(*self.alarms, *alarms))
 
 
 def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
@@ -88,19 +89,27 @@ def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
     them no error grows. Fewer than three logs are each divided in time: half, a quarter, a quarter.
     """
     parts: dict[str, list[Log]] = {"train": [], "validation": [], "test": []}
-    least = _PIECE * float(np.median([len(log) for log in logs])) if logs else 0.0
-    whole = [log for log in logs if len(log) >= least]
-    if len(whole) >= 3:
+    whole, pieces = _whole(logs)
+    if len(whole) >= _APART:
         for i, log in enumerate(_ordered(whole)):
             parts[_DEAL[i % len(_DEAL)]].append(log)
-        parts["train"] += [log for log in logs if len(log) < least]
+        parts["train"] += pieces
         return parts
-    for log in logs:
+    for log in whole:
         length = len(log)
         ends = 0, length // 2, 3 * length // 4, length
         for name, begin, end in zip(parts, ends, ends[1:], strict=False):
             parts[name].append(_rows(log, begin, end))
+    parts["train"] += pieces
     return parts
+
+
+def _whole(logs: Sequence[Log]) -> tuple[list[Log], list[Log]]:
+    """Return the logs, and those that are pieces, much shorter than the others."""
+    least = _PIECE * float(np.median([len(log) for log in logs])) if logs else 0.0
+    short = [len(log) < least for log in logs]
+    whole = [log for log, is_short in zip(logs, short, strict=True) if not is_short]
+    return whole, [log for log, is_short in zip(logs, short, strict=True) if is_short]
 
 
 def _ordered(logs: Sequence[Log]) -> list[Log]:
@@ -153,7 +162,7 @@ def prepare(
     if rows <= max(_FEWEST, horizon or 0):
         expected = f"runs of more than {max(_FEWEST, horizon or 0)} rows in every split"
         raise ValueError(message(expected, f"{rows} rows", hint="record longer"))
-    if len(logs) < 3:
+    if len(_whole(logs)[0]) < _APART:
         alarms.append(
             f"{len(logs)} trajectories: training, validation and test are stretches of the same "
             "runs, and intervals are too narrow"

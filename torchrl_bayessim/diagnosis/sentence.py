@@ -175,25 +175,35 @@ def _described(effect: Finding) -> str:
             return f"{name} at {len(effect.strengths)} places ({each} each)"
         sizes = f"{least:.3g} to {most:.3g} {effect.unit}, mean {effect.strength:.3g} ± {half:.2g}"
         return f"{name} at {len(effect.strengths)} places ({sizes}{law})"
-    place = "at all" if effect.where == "all" else f"at {effect.where}"
+    place = "at all at once" if effect.where == "all" else f"at {effect.where}"
     return f"{name} {place} ({effect.strength:.3g} ± {half:.2g} {effect.unit}{law})"
 
 
 def _ruled_out(candidates: Sequence[Candidate]) -> str:
     """Return what would have been seen, for the effects that were not."""
-    found: dict[str, str] = {}
-    for c in candidates:
-        if c.status == "ruled_out" and c.minimal_detectable_strength is not None:
-            name, least = plain(c.name), c.minimal_detectable_strength
-            text = f"{name} above {least:.2g} {c.unit} {_place(c)}"
-            found.setdefault(c.name, text)
-    some = list(found.values())[:4]
+    names = dict.fromkeys(c.name for c in candidates if _seen(c))
+    found = [_least([c for c in candidates if c.name == name]) for name in names]
+    some = found[:4]
     more = f" and {len(found) - 4} more" if len(found) > 4 else ""
     return f" Ruled out: {', '.join(some)}{more}." if some else ""
 
 
-def _place(candidate: Candidate) -> str:
-    return f"at {candidate.where}" if candidate.where != "all" else "anywhere"
+def _seen(candidate: Candidate) -> bool:
+    least = candidate.minimal_detectable_strength
+    return candidate.status == "ruled_out" and least is not None
+
+
+def _least(candidates: Sequence[Candidate]) -> str:
+    """Return above which strength an effect would have been seen, and where."""
+    single = [c for c in candidates if c.where != "all"]
+    shown = [c for c in single if _seen(c)] or [c for c in candidates if _seen(c)]
+    worst = max(shown, key=lambda c: c.minimal_detectable_strength or 0.0)
+    place = "at all at once" if worst.where == "all" else f"at {worst.where}"
+    if len({c.where for c in single}) > 1 and len(shown) == len(single):
+        place = "anywhere"
+    law = "".join(text.format(worst.form[k]) for k, text in _FORMS.items() if k in worst.form)
+    least = f"{worst.minimal_detectable_strength:.2g} {worst.unit}"
+    return f"{plain(worst.name)}{law} above {least} {place}"
 
 
 def _untested(candidates: Sequence[Candidate]) -> str:

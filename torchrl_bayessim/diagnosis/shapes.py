@@ -54,9 +54,9 @@ def shaped(
         noise: Standard deviation of each channel's noise.
         pushes: A constant force at each joint.
     """
-    shortest = min(len(log) for log in logs)
     history = _BEFORE if point.strengths else 1
-    if not pushes or shortest <= max(2 * _STEPS, history + _STEPS):
+    logs = [log for log in logs if len(log) > max(2 * _STEPS, history + _STEPS)]
+    if not pushes or not logs:
         return []
     system = predictor.system
     pieces = cut(logs, _STEPS, history=history, most=_MOST)

@@ -224,7 +224,8 @@ def _obstacle(system: System, prepared: Prepared, *, diverges: bool) -> tuple[st
 def _excited(system: System, prepared: Prepared) -> bool:
     """Return whether the robot moved by more than its sensors' noise."""
     segments = prepared.sets["train"].segments
-    moved = np.concatenate([segments.qpos, segments.qvel], -1)
+    turned = prepared.predictor.tangent.difference(segments.qpos[:1, :1], segments.qpos)
+    moved = np.concatenate([turned, segments.qvel], -1)
     spread = moved.reshape(-1, moved.shape[-1]).std(0)[list(system.channel_index)]
     return bool((spread > 5.0 * prepared.noise).any())
 

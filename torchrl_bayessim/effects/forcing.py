@@ -122,7 +122,7 @@ class _TimeStep(SimpleNamespace):
     def under(self, command: Tensor) -> _TimeStep:
         """Return the same time step under another command."""
         values = vars(self) | {"command": command}
-        computed = "actuator_force", "load"
+        computed = "actuator_force", "demanded_force", "load"
         return _TimeStep(**{k: v for k, v in values.items() if k not in computed})
 
     @cached_property
@@ -132,6 +132,10 @@ class _TimeStep(SimpleNamespace):
     @cached_property
     def actuator_force(self) -> Tensor:
         return self.actuators.force(self.command, self.position, self.actuator_velocity)
+
+    @cached_property
+    def demanded_force(self) -> Tensor:
+        return self.actuators.demanded(self.command, self.position, self.actuator_velocity)
 
     @cached_property
     def load(self) -> Tensor:
@@ -156,11 +160,16 @@ class _Actuators:
 
     def force(self, command: Tensor, position: Tensor, velocity: Tensor) -> Tensor:
         """Return the force of each, given joint positions and the actuators' own velocities."""
-        force = self.gain * command.clamp(*self._command_limits) + self._bias[:, 0]
+        force = self.demanded(command.clamp(*self._command_limits), position, velocity)
+        return force.clamp(*self._force_limits)
+
+    def demanded(self, command: Tensor, position: Tensor, velocity: Tensor) -> Tensor:
+        """Return the same without limits."""
+        force = self.gain * command + self._bias[:, 0]
         if self._bias[:, 1:].any():  # a servo
             force = force + self._bias[:, 1] * (position @ self.moment.T)
             force = force + self._bias[:, 2] * velocity
-        return force.clamp(*self._force_limits)
+        return force
 
 
 def _limits(limited: object, ranges: object) -> tuple[Tensor, Tensor]:

@@ -71,7 +71,10 @@ def _at_actuators(values: Tensor, robot: Robot) -> Tensor:
 
 
 def _change(force: Tensor, now: Now) -> Mapping[str, Tensor]:
-    return {"command": (force - now.actuator_force) / now.actuator_gain}
+    """Return the change of commands under which actuators exert ``force``, within their limits."""
+    # of a command that is beyond its limits, all that is beyond has to go first
+    change = (force - now.demanded_force) / now.actuator_gain
+    return {"command": torch.where(force == now.actuator_force, 0.0, change)}
 
 
 class TorqueSpeedLimit(_Transmission):

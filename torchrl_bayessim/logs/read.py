@@ -4,6 +4,7 @@ from __future__ import annotations
 
 __all__ = ["read_logs", "read_records"]
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -44,7 +45,7 @@ def read_records(source: Source, system: System) -> list[Record]:
         check_kind(expected, source, list, tuple)
         for path in source:
             check_kind(expected, path, str, Path)
-        tables = [_file_table(Path(path), system) for path in source]
+        tables = _files([Path(path) for path in source], system)
     if not tables:
         raise ValueError(message("at least one log", "none"))
     return [record_of(table, system) for table in tables]
@@ -93,6 +94,19 @@ def _tables(path: Path, system: System) -> list[Table]:
         return tensordict_tables(path, system)
     expected = "a folder with CSV or Parquet files, a Minari dataset or a saved TensorDict"
     raise ValueError(message(expected, str(path)))
+
+
+def _files(paths: Sequence[Path], system: System) -> list[Table]:
+    """Return the tables of files; those of one name in several folders are named with these."""
+    places = Counter(path.resolve() for path in paths)
+    twice = [str(path) for path, count in places.items() if count > 1]
+    if twice:
+        raise ValueError(message("each file once", f"{twice[0]} twice"))
+    names = Counter(path.name for path in paths)
+    return [
+        table if names[path.name] == 1 else table._replace(name=str(path))
+        for path, table in ((path, _file_table(path, system)) for path in paths)
+    ]
 
 
 def _file_table(path: Path, system: System) -> Table:

@@ -24,7 +24,7 @@ class Record:
 
     Attributes:
         name: The file's name.
-        time: Seconds, shape ``(T,)``; NaN where it is no time.
+        time: Seconds since the first row, shape ``(T,)``; NaN where it is no time.
         qpos: Shape ``(T, nq)``; quaternions are normalised and do not change sign between rows.
         qvel: Shape ``(T, nv)``.
         ctrl: The action held from each row on, shape ``(T, nu)``.
@@ -69,6 +69,8 @@ def record_of(table: Table, system: System) -> Record:
     else:
         time = table.columns[columns.time]
         time = np.where(np.abs(time) < _LATEST, time, np.nan)
+        known = time[np.isfinite(time)]
+        time = time - known[:1].sum()  # since the run began, as effects that grow with it mean it
     return Record(name=table.name, time=time, qpos=qpos, qvel=qvel, ctrl=ctrl)
 
 
