@@ -101,7 +101,7 @@ def _names(model: Model) -> set[str]:
 def _sliding(
     sets: tuple[Objective, Objective], best: Model, kept: dict[Unit, float], units: Sequence[Unit]
 ) -> list[Model]:
-    """Return friction in contacts in the place of an effect, fitted from the prior's centre.
+    """Return friction in contacts in the place of an effect, fitted from the prior's mean.
 
     With another mass, and an armature beside it, all that slides moves as with another friction.
     Between the two lies a valley that no descent goes along; and what sticks and slips is rough.

@@ -36,7 +36,7 @@ from .shrinkage import Shrinkage
 from .verdict import conclude
 
 Array = NDArray[np.float64]
-_TOLD: tuple[str, ...] = "as described", "with fitted parameters", "with the effects"
+_TOLD: tuple[str, ...] = "at the prior's mean", "with fitted parameters", "with the effects"
 
 
 def assemble(

@@ -87,7 +87,7 @@ def explanations(train: Objective, now: Round) -> list[Fit]:
 
     Where the gap is large the screen's linear view from a bent nominal fit can mislead: a damping
     that has absorbed dry friction leaves nothing for friction to explain. So every effect gets a
-    try: from there, from the prior's centre, and with the parameters moved to make room for it.
+    try: from there, from the prior's mean, and with the parameters moved to make room for it.
     """
     base = now.base
     starts, origins = _starts(now)

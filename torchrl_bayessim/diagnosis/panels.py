@@ -71,7 +71,7 @@ def _rollouts(report: Report) -> Markup | None:
     raw, before, after = (errors.get(n, {}) for n in ("raw", "refit", "with_effects"))
     if not before:
         return None
-    head = ["output", "as described", "parameters fitted", "with effects", "ratio"]
+    head = ["output", "prior's mean", "parameters fitted", "with effects", "ratio"]
     rows = [
         [name, number(raw.get(name)), *map(number, pair), ratio(*pair)]
         for name, pair in ((n, (error, after.get(n))) for n, error in before.items())

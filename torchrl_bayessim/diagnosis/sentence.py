@@ -97,13 +97,13 @@ def _retuned(measured: Shrinkage, *, fitted: bool, found: bool) -> str:
 
     >>> harmed = Shrinkage(3.0, 9.0, 2.0, 0.875, (0.8, 0.9), (7.0, 9.0), (0.9, 1.1))
     >>> _retuned(harmed, fitted=True, found=True)  # doctest: +NORMALIZE_WHITESPACE
-    ' Retuning parameters alone makes test runs worse: 3 times the floor as described,
-    50 % of which parameters and effects explain together.'
+    " Retuning parameters alone makes test runs worse: 3 times the floor at the prior's mean,
+    50 % of which parameters and effects explain together."
     """
     if fitted and measured.raw > measured.refit:
         share = _percent(min(measured.by_parameters, 1.0))
         return (
-            f" Retuning parameters alone removes {share} of the gap as described "
+            f" Retuning parameters alone removes {share} of the gap at the prior's mean "
             f"({measured.raw:.3g} times the floor)."
         )
     if not measured.misled:
@@ -111,7 +111,7 @@ def _retuned(measured: Shrinkage, *, fitted: bool, found: bool) -> str:
     together = f", {_percent(measured.of_raw)} of which parameters and effects explain together"
     return (
         f" Retuning parameters alone makes test runs worse: {measured.raw:.3g} times the floor "
-        f"as described{together if found and measured.raw > SHOWN else ''}."
+        f"at the prior's mean{together if found and measured.raw > SHOWN else ''}."
     )
 
 

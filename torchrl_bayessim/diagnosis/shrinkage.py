@@ -26,7 +26,7 @@ _FLOOR_ERROR = 0.05  # relative standard deviation of a noise floor, squared uni
 # Other motions differ by more than those of a few logs do. Of 86 robots whose cause was known and
 # named, 92 % had their true share in an interval so much wider, and never narrower; 73 % without.
 _OTHER_MOTIONS, _NARROWEST = 3.0, 0.01
-_WORSE = 1.2  # times the error as described, with parameters fitted to other runs
+_WORSE = 1.2  # times the error at the prior's mean, with parameters fitted to other runs
 
 
 @dataclass(frozen=True)
@@ -56,17 +56,17 @@ class Shrinkage:
 
     @property
     def by_parameters(self) -> float:
-        """Share of the excess as described that fitting parameters alone removes."""
+        """Share of the excess at the prior's mean that fitting parameters alone removes."""
         return (self.raw - self.refit) / max(self.raw - 1.0, 1e-9)
 
     @property
     def misled(self) -> bool:
-        """Whether parameters that were fitted to other runs do worse than those as described."""
+        """Whether parameters that were fitted to other runs do worse than the prior's mean."""
         return self.refit > _WORSE * self.raw
 
     @property
     def of_raw(self) -> float:
-        """Share of the excess as described that parameters and effects remove together.
+        """Share of the excess at the prior's mean that parameters and effects remove together.
 
         Example:
             >>> Shrinkage(3.0, 9.0, 2.0, 0.875, (0.8, 0.9), (7.0, 9.0), (0.9, 1.1)).of_raw
