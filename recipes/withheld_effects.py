@@ -5,7 +5,7 @@
 
 A generator of its own (its own stepping loop, laws and finer integration; nothing of the package)
 draws robots, causes, strengths, places, noise and excitation. Labels go to ``sealed/labels.json``,
-whose SHA-256 is printed before the first diagnosis; the diagnosis is given a folder with
+whose SHA-256 is printed and kept before the first diagnosis; the diagnosis is given a folder with
 ``system.yaml``, the nominal model and CSV files. When all reports are written, the labels are
 opened, checked against the sum, and the reports are scored, once.
 
@@ -86,6 +86,10 @@ def job(settings: Withheld, out: Path) -> dict[str, Any]:
     if not sealed.exists():
         generate(settings, out, robots=robots, tiers=tiers)
     seal = folders.digest(sealed)
+    kept = out / "seal.txt"
+    if not kept.exists():
+        write_text(kept, seal)
+    check_sealed(sealed, kept.read_text())
     print(f"labels sealed: sha256 {seal}", flush=True)
     names = sorted(path.name for path in (out / "cases").iterdir())
     for name in _progress(names, settings, "diagnosing"):
@@ -94,8 +98,7 @@ def job(settings: Withheld, out: Path) -> dict[str, Any]:
     if settings.baselines:
         for name in _progress(names, settings, "asking baselines"):
             ask_baselines(out, name, seed=settings.seed)
-    if folders.digest(sealed) != seal:
-        raise ValueError(message("labels as they were sealed", "another file"))
+    check_sealed(sealed, seal)
     labels = json.loads(sealed.read_text())
     everyone = scored(settings, out, labels)
     records = everyone[DIAGNOSIS]
@@ -135,7 +138,8 @@ def generate(settings: Withheld, out: Path, *, robots: list[str], tiers: dict[st
             rng = np.random.default_rng([settings.seed, 1 + i])
             case = cases.make(plan, rng)
             write_case(out, name, case, rng)
-        labels[name] = json.loads(label.read_text())
+        unseen = folders.digest(out / "sealed" / name / "unseen.npz")
+        labels[name] = json.loads(label.read_text()) | {"unseen_sha256": unseen}
     write_text(out / "sealed" / "labels.json", json.dumps(labels, indent=1))
 
 
@@ -151,6 +155,19 @@ def write_case(out: Path, name: str, case: cases.Case, rng: np.random.Generator)
     with replacing(sealed / "unseen.npz") as file:
         file.write(folders.unseen(case))
     write_text(sealed / "label.json", json.dumps(label))
+
+
+def check_sealed(labels: Path, seal: str) -> None:
+    """Refuse labels, or motions sealed with them, that are not those of the seal.
+
+    Raises:
+        ValueError: One of these files has changed since.
+    """
+    if folders.digest(labels) != seal:
+        raise ValueError(message("labels as they were sealed", "another file"))
+    for name, label in json.loads(labels.read_text()).items():
+        if folders.digest(labels.parent / name / "unseen.npz") != label["unseen_sha256"]:
+            raise ValueError(message(f"the motions of {name} as they were sealed", "others"))
 
 
 def examine(case: Path, report: Path, *, seed: int) -> None:

@@ -180,13 +180,13 @@ def test_saturation_dead_band_gain_and_bias_are_what_the_label_says():
     cut = actuation.saturation(site())
     assert arrives(cut, 4.0) == pytest.approx(4.0 * (1 - cut[1].strength["fraction"]))
     band = actuation.dead_band(site())
-    width = band[1].strength["N m"]
+    width = band[1].strength["command"]
     assert arrives(band, width / 2) == 0.0
     assert arrives(band, -1 - width) == pytest.approx(-1.0)
     louder = actuation.gain(site())
     assert arrives(louder, 2.0) == pytest.approx(2.0 * (1 + louder[1].strength["fraction"]))
     pushed = actuation.bias(site())
-    assert arrives(pushed, 2.0) == pytest.approx(2.0 + pushed[1].strength["N m"])
+    assert arrives(pushed, 2.0) == pytest.approx(2.0 + pushed[1].strength["command"])
 
 
 def test_a_rotor_behind_a_spring_reaches_the_same_momentum():
@@ -287,7 +287,34 @@ def test_payload_at_the_tip_has_the_inertia_of_a_point():
     data, full = mujoco.MjData(model), np.zeros((1, 1))
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, full)
-    assert full[0, 0] - before == pytest.approx(share * 1.0 * 0.4**2, rel=1e-6)
+    # at twice the distance of the centre, and half of that to the side
+    assert full[0, 0] - before == pytest.approx(share * 1.0 * (0.4**2 + 0.1**2), rel=1e-6)
+
+
+@pytest.mark.parametrize("form", ["same", "other"])
+def test_friction_under_load_is_the_motors_in_the_usual_form_only(form):
+    from withheld.causes_body import load_dependent
+
+    cause, truth = load_dependent(site(form))
+    held = plant(cause)
+    held.data.qfrc_actuator[0], held.data.qfrc_bias[0] = 2.0, -1.5
+    held.data.qvel[0] = 1.0
+    share = 0.0125 * math.exp(np.random.default_rng(0).uniform() * math.log(0.35 / 0.0125))
+    load = 2.0 if form == "same" else 0.5
+    assert cause.force(held)[0] == pytest.approx(-share * load, rel=1e-6)
+    assert truth.strength == ({"fraction": pytest.approx(share)} if form == "same" else {})
+
+
+def test_tilted_gravity_has_the_sign_of_the_report():
+    from withheld.causes_body import tilt
+
+    cause, truth = tilt(site())
+    model, angle = plant().model, truth.strength["rad"]
+    model.opt.gravity[:] = 0.0, 0.0, -9.81
+    cause.write(model)
+    # as the catalogue turns it about y, see test_laws.test_entries
+    expected = [-9.81 * math.sin(angle), 0.0, -9.81 * math.cos(angle)]
+    np.testing.assert_allclose(model.opt.gravity, expected, atol=1e-9)
 
 
 def test_every_cause_changes_the_motion_and_is_called_what_it_is():
@@ -546,6 +573,45 @@ def test_a_wrong_name_counts_only_where_the_verdict_stands_by_it():
     assert one["strength_covered"]
 
 
+def test_who_names_nothing_has_found_no_place_and_reserve_is_told():
+    from withheld.scoring import record, scores
+
+    truth = {
+        "name": "coulomb_friction", "joint": "elbow", "channel": "body", "strength": {},
+        "places": ["elbow"],
+    }  # fmt: skip
+    label = {
+        "tier": "T1", "robot": "two_links", "form": "same", "engine": "fine",
+        "detectability": 500.0, "excitation": "open", "velocities": True, "runs": 8,
+        "noise_told": True, "truths": [truth],
+    }  # fmt: skip
+    effect = {
+        "name": "coulomb_friction", "where": "elbow", "strength": 0.2, "unit": "N m",
+        "ci95": [0.1, 0.3], "strengths": {"elbow": 0.2},
+    }  # fmt: skip
+    report = {
+        "effects": [effect], "confusion_set": ["coulomb_friction", "stribeck_friction"],
+        "seconds": 1.0, "where": {"channel": {"body": 0.9, "actuation": 0.1}},
+        "audit": {"p_values": [0.25, 1.0]}, "candidates": [{"p_value": 1.0}],
+    }  # fmt: skip
+    found = record(label, report | {"verdict": "ambiguous"})
+    lost = record(label, report | {"verdict": "unknown", "confusion_set": []})
+    crashed = record(label, {"verdict": "crash", "seconds": 1.0})
+    assert (found["channel"], found["joint"]) == (True, True)
+    assert found["p_value"] == 0.25
+    assert (lost["channel"], lost["joint"]) == (False, False)
+    every = [found, lost, crashed]
+    result = scores([*every, *(one | {"tier": "T3"} for one in every)], threshold=100.0)
+    assert result["where"]["joint"]["value"] == pytest.approx(1 / 3)
+    assert result["where"]["joint_of_right_class"]["value"] == 1.0
+    t1, t3 = result["tiers"]["T1"], result["tiers"]["T3"]
+    assert t1["right_as_ambiguous"]["value"] == pytest.approx(1 / 3)
+    assert t1["set_size"] == 2.0
+    assert t1["no_set"]["value"] == pytest.approx(2 / 3)
+    assert t3["wrong_named"]["value"] == pytest.approx(1 / 3)  # the crash
+    assert t3["wrong_with_any_reserve"]["value"] == pytest.approx(2 / 3)
+
+
 def test_no_name_is_in_two_classes_and_the_true_one_is_withheld():
     from withheld.classes import NAMES, class_of, without_class_of
 
@@ -611,5 +677,12 @@ def test_it_seals_diagnoses_and_scores_and_does_so_again(
         assert handed - {path.name for path in case.glob("run*.csv")} == {
             "system.yaml", "robot.xml"
         }  # fmt: skip
+    unseen = next((tmp_path / "run" / "sealed").glob("*/unseen.npz"))
+    withheld_effects.check_sealed(sealed, digest)
+    unseen.write_bytes(b"another")
+    with pytest.raises(ValueError, match=r"expected the motions of .* as they were sealed"):
+        withheld_effects.check_sealed(sealed, digest)
+    with pytest.raises(ValueError, match="expected labels as they were sealed"):
+        withheld_effects.check_sealed(sealed, "0" * 64)
     said = {path.name for path in (tmp_path / "run").iterdir()}
     assert {"page.md", "confusion.png", "calibration.png", "records.json"} <= said

@@ -67,7 +67,7 @@ def dead_band(site: Site) -> Made:
             return math.copysign(max(abs(u) - s, 0.0), u)
         return u - s * math.tanh(u / s)
 
-    return Commands(site, law), site.truth("dead_band", "actuation", N_m=s, N=s, fraction=s)
+    return Commands(site, law), site.truth("dead_band", "actuation", command=s)
 
 
 def saturation(site: Site) -> Made:
@@ -100,7 +100,7 @@ def bias(site: Site) -> Made:
         wander = 0.0 if site.same else 0.2 * math.sin(2.0 * plant.time)
         return u + s * (1 + wander)
 
-    return Commands(site, law), site.truth("action_bias", "actuation", N_m=s, N=s)
+    return Commands(site, law), site.truth("action_bias", "actuation", command=s)
 
 
 def torque_speed(site: Site) -> Made:

@@ -77,21 +77,21 @@ def drag(site: Site) -> Made:
     """Proportional to speed squared; or to a lower power of it."""
     s = site.draw(0.0025, 0.1) * site.torque
     power = 2.0 if site.same else 1.7
-    truth = site.truth("quadratic_drag", "body")
+    truth = site.truth("quadratic_drag", "body", **{"N_m_s²/rad²": s, "N_s²/m²": s})
     return Forces(site, lambda _q, v, *_: -s * math.copysign(abs(v) ** power, v)), truth
 
 
 def load_dependent(site: Site) -> Made:
-    """Proportional to motor minus external torque; or to the motor's alone."""
+    """Proportional to the motor's torque; or to motor minus external torque."""
     s = site.draw(0.0125, 0.35)
 
     def law(_: float, v: float, plant: Plant, memory: dict) -> float:  # noqa: ARG001
         load = plant.data.qfrc_actuator[site.dof]
-        if site.same:
+        if not site.same:
             load = load + plant.data.qfrc_bias[site.dof]
         return -s * abs(load) * _dry(v)
 
-    return Forces(site, law), site.truth("load_dependent_friction", "body")
+    return Forces(site, law), site.truth("load_dependent_friction", "body", fraction=s)
 
 
 def directional(site: Site) -> Made:
@@ -103,7 +103,8 @@ def directional(site: Site) -> Made:
         share = _dry(v) if site.same else 1 - math.exp(-max(v, 0.0) / 0.15)
         return -side * s * share if v > 0 else 0.0
 
-    return Forces(site, law), site.truth("directional_friction", "body")
+    truth = site.truth("directional_friction", "body", N_m=side * s, N=side * s)
+    return Forces(site, law), truth
 
 
 def spring(site: Site) -> Made:
@@ -125,7 +126,7 @@ def tilt(site: Site) -> Made:
             g * math.sin(s), g * math.sin(roll) * math.cos(s), -g * math.cos(s) * math.cos(roll)
         )  # fmt: skip
 
-    return Writes(law), site.truth("gravity_tilt", "body", joint="all", rad=s)
+    return Writes(law), site.truth("gravity_tilt", "body", joint="all", rad=-s)
 
 
 def periodic(site: Site) -> Made:
@@ -137,7 +138,7 @@ def periodic(site: Site) -> Made:
         angle = 2 * math.pi * hertz * plant.time + phase
         return s * (math.sin(angle) + (0.0 if site.same else 0.3 * math.sin(3 * angle)))
 
-    return Forces(site, law), site.truth("periodic_disturbance", "body")
+    return Forces(site, law), site.truth("periodic_disturbance", "body", N_m=s, N=s)
 
 
 def cogging(site: Site) -> Made:
@@ -149,7 +150,7 @@ def cogging(site: Site) -> Made:
         angle = teeth * q + phase
         return s * (math.sin(angle) + (0.0 if site.same else 0.4 * math.sin(2 * angle)))
 
-    return Forces(site, law), site.truth("cogging", "body")
+    return Forces(site, law), site.truth("cogging", "body", N_m=s, N=s)
 
 
 def _moving_body(site: Site) -> int:
@@ -158,15 +159,16 @@ def _moving_body(site: Site) -> int:
 
 
 def payload(site: Site) -> Made:
-    """More mass, spread as the body's; or a point mass at the far end."""
+    """More mass, spread as the body's; or a point mass at the far end, and beside it."""
     body, share = _moving_body(site), site.draw(0.02, 0.6)
 
     def law(model: mujoco.MjModel) -> None:
         mass = model.body_mass[body]
         if site.same:
             model.body_inertia[body] *= 1 + share
-        else:  # at the far end: twice as far as the centre
+        else:  # twice as far as the centre, and half of that towards x
             offset = model.body_ipos[body].copy()
+            offset[0] += 0.5 * float(np.linalg.norm(offset))
             model.body_ipos[body] += offset * share / (1 + share)
             model.body_inertia[body][:2] += mass * share / (1 + share) * offset @ offset
         model.body_mass[body] = mass * (1 + share)
@@ -193,7 +195,8 @@ def armature(site: Site) -> Made:
     def law(model: mujoco.MjModel) -> None:
         model.dof_armature[site.dof] *= 1 + s
 
-    return Writes(law), site.truth("armature", "body", fraction=s)
+    kilograms = s * float(site.model.dof_armature[site.dof])
+    return Writes(law), site.truth("armature", "body", **{"kg_m²": kilograms, "kg": kilograms})
 
 
 def contact_friction(site: Site) -> Made:

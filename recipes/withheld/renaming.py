@@ -83,6 +83,8 @@ def same_answer(
     """Return whether two reports say the same up to names: verdict, causes, places, strengths."""
     mine, others = ([(e["name"], e["where"], e["strength"]) for e in one.get("effects", ())]
                     for one in (report, other))  # fmt: skip
+    if "crash" in {report["verdict"], other["verdict"]}:
+        return False
     if report["verdict"] != other["verdict"] or len(mine) != len(others):
         return False
     return all(

@@ -69,7 +69,7 @@ def record(
         "verdict": report["verdict"], "summary": report.get("summary", ""),
         "named": named, "named_class": [class_of(name) for name in named],
         "confusion_set": confused, "seconds": report["seconds"],
-        "p_value": min((c["p_value"] for c in report.get("candidates", ())), default=None),
+        "p_value": next(iter(report.get("audit", {}).get("p_values", ())), None),
     }  # fmt: skip
     if shrinks is not None and report["verdict"] in NAMING:
         gap = report["gap"]
@@ -77,7 +77,7 @@ def record(
             "true": shrinks, "predicted": gap["explained_fraction"], "ci95": gap["ci95"]
         }  # fmt: skip
     if len(truths) == 1:
-        one |= _single(truths[0], effects, confused, report)
+        one |= _single(truths[0], effects, confused) | _located(truths[0], effects, report)
     if len(truths) == 2:
         found, wanted = set(one["named_class"]), set(one["class"])
         one["exact"] = found == wanted and len(named) == 2
@@ -86,7 +86,7 @@ def record(
 
 
 def _single(
-    truth: Mapping[str, Any], effects: Sequence[Mapping], confused: Sequence[str], report: Mapping
+    truth: Mapping[str, Any], effects: Sequence[Mapping], confused: Sequence[str]
 ) -> Record:
     first = effects[0] if effects else None
     one: Record = {
@@ -98,17 +98,26 @@ def _single(
     }
     if first is None:
         return one
-    if truth["joint"] != "all" and one["top1_class"]:
-        place = _place(first["where"], first["strengths"])
-        one["joint"] = any(f"{place} ".startswith(f"{name} ") for name in truth["places"])
-    channels = (report.get("where") or {}).get("channel") or {}
-    if channels and truth["channel"] in _CHANNELS:
-        one["channel"] = max(channels, key=lambda name: channels[name]) == truth["channel"]
     if one["top1"] and first["unit"] in truth["strength"] and first["where"] != "all":
         value = truth["strength"][first["unit"]]
         low, high = first["ci95"]
         one["strength_error"] = abs(first["strength"] - value) / abs(value)
         one["strength_covered"] = low <= value <= high
+    return one
+
+
+def _located(
+    truth: Mapping[str, Any], effects: Sequence[Mapping], report: Mapping[str, Any]
+) -> Record:
+    """Return whether channel and joint are right; who names nothing has found neither."""
+    one: Record = {}
+    if truth["channel"] in _CHANNELS:
+        channels = (report.get("where") or {}).get("channel") or {}
+        said = max(channels, key=lambda name: channels[name]) if effects and channels else None
+        one["channel"] = said == truth["channel"]
+    if truth["joint"] != "all":
+        place = _place(effects[0]["where"], effects[0]["strengths"]) if effects else ""
+        one["joint"] = any(f"{place} ".startswith(f"{name} ") for name in truth["places"])
     return one
 
 
@@ -137,7 +146,15 @@ def scores(records: Sequence[Record], *, threshold: float) -> dict[str, Any]:
         "oracle_by_detectability": _strata(records, "oracle_class"),
         "where": {
             "channel": share(r["channel"] for r in known if "channel" in r),
+            "channel_of_right_class": share(
+                r["channel"] for r in known if "channel" in r and r["top1_class"]
+            ),
             "joint": share(r["joint"] for r in known if "joint" in r and r["robot"] != "arm"),
+            "joint_of_right_class": share(
+                r["joint"]
+                for r in known
+                if "joint" in r and r["robot"] != "arm" and r["top1_class"]
+            ),
         },
         "regime": _regime([r["regime"] for r in known if r.get("regime")]),
         "strength": {
@@ -200,8 +217,15 @@ def _tier(tier: str, every: Sequence[Record], visible: Sequence[Record]) -> dict
     if tier == "shuffled":
         return {"n": len(mine), "wrong_named": share(r["verdict"] == "named" for r in mine)}
     if tier in {"T3", "T4"}:
-        wrong = share(r["verdict"] == "named" for r in seen)
-        return {"n": len(seen), "wrong_named": wrong, "silent": share(not alarm(r) for r in seen)}
+        return {
+            "n": len(seen),
+            "wrong_named": share(r["verdict"] in {"named", "crash"} for r in seen),
+            "wrong_named_or_in_part": share(
+                r["verdict"] in {"named", "named_partial", "crash"} for r in seen
+            ),
+            "wrong_with_any_reserve": share(r["verdict"] in {*NAMING, "crash"} for r in seen),
+            "silent": share(not alarm(r) for r in seen),
+        }
     if tier == "T5":
         return {
             "n": len(seen),
@@ -215,8 +239,15 @@ def _tier(tier: str, every: Sequence[Record], visible: Sequence[Record]) -> dict
         "top1_class": share(r["top1_class"] for r in single),
         "set_coverage": share(r["covered"] for r in single),
         "set_coverage_class": share(r["covered_class"] for r in single),
-        "set_size": sum(max(r["set_size"], 1) for r in single) / len(single) if single else None,
+        "set_size": _mean([r["set_size"] for r in single if r["set_size"]]),
+        "no_set": share(not r["set_size"] for r in single),
         "named_right": share(r["top1_class"] for r in single if r["verdict"] == "named"),
+        **{
+            f"right_as_{verdict}": share(
+                r["verdict"] == verdict and r["top1_class"] for r in single
+            )
+            for verdict in sorted(NAMING)
+        },
         "silent": share(not alarm(r) for r in single),
     }
     if tier in {"T6", "T6B"}:
@@ -224,6 +255,10 @@ def _tier(tier: str, every: Sequence[Record], visible: Sequence[Record]) -> dict
         # another integrator or contact model is a gap that may be seen; it has no name
         result["none_wrong_named"] = share(r["verdict"] == "named" for r in none)
     return result
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None
 
 
 def _strata(records: Sequence[Record], score: str) -> dict[str, Any]:
