@@ -28,6 +28,7 @@ ELSEWHERE = {
     "PosteriorRefinement.state_dict": "takes nothing",
     "ApplyEffect.know": "called by its container",
     "BatchedMujocoEnv.add": "called by transforms",
+    "BatchedMujocoEnv.meanwhile": "called by next_batch: tests/test_overlapped.py",
     "AttributePhysics.read": "called by ApplyPhysics",
     "MujocoPhysics.read": "called by ApplyPhysics",
     "StatePhysics.read": "called by ApplyPhysics",

@@ -191,14 +191,14 @@ def _check_log(log: Log, system: System) -> None:
         if value.shape != size:
             expected = f"logs of this simulator, {name} of shape {size}"
             raise ValueError(message(expected, f"{tuple(value.shape)} in {log.name}", hint=hint))
-    measured = np.flatnonzero(log.measured.numpy()).tolist()
+        if name != "measured" and not value.is_floating_point():
+            expected = f"{name} of {log.name} in floating-point numbers"
+            raise TypeError(message(expected, str(value.dtype), hint=hint))
+    measured = log.measured.nonzero()[:, 0].tolist()
     if measured != sorted(system.channel_index):
         expected = f"logs in which {', '.join(system.robot.channels)} were measured"
         got = f"{len(measured)} measured coordinates in {log.name}"
         raise ValueError(message(expected, got, hint=hint))
-        if name != "measured" and not value.is_floating_point():
-            expected = f"{name} of {log.name} in floating-point numbers"
-            raise TypeError(message(expected, str(value.dtype), hint=hint))
     for name in ("time", "qpos", "qvel", "ctrl"):
         if not bool(getattr(log, name).isfinite().all()):
             got = f"NaN or infinity in {name} of {log.name}"
