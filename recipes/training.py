@@ -120,7 +120,8 @@ def _chunk(
         collector.set_seed(seed_from(*key, first, "env") % 2**31)
         collector.reset()
     learning = Overlapped(learner)
-    for index in range(first, (until := min(first + plan.keep_every, plan.batches))):
+    until = min(first + plan.keep_every, plan.batches)
+    for index in range(first, until):
         wall, cpu = time.monotonic(), time.process_time()
         with isolated(*key, index):
             batch = next_batch(collector, meanwhile=learning.meanwhile)

@@ -85,11 +85,11 @@ def job(settings: Withheld, out: Path) -> dict[str, Any]:
     sealed = out / "sealed" / "labels.json"
     if not sealed.exists():
         generate(settings, out, robots=robots, tiers=tiers)
-    seal = folders.digest(sealed)
     kept = out / "seal.txt"
     if not kept.exists():
-        write_text(kept, seal)
-    check_sealed(sealed, kept.read_text())
+        write_text(kept, folders.digest(sealed))
+    seal = kept.read_text()
+    check_sealed(sealed, seal)
     print(f"labels sealed: sha256 {seal}", flush=True)
     names = sorted(path.name for path in (out / "cases").iterdir())
     for name in _progress(names, settings, "diagnosing"):

@@ -537,21 +537,29 @@ def test_wilson_intervals():
     assert wilson(0, 300)[1] == pytest.approx(0.0126, abs=1e-4)
 
 
+def _label(tier: str, robot: str, truth: dict) -> dict:
+    return {
+        "tier": tier, "robot": robot, "form": "same", "engine": "fine", "detectability": 500.0,
+        "excitation": "open", "velocities": True, "runs": 8, "noise_told": True, "truths": [truth],
+    }  # fmt: skip
+
+
+def _finding(name: str, where: str, strength: float) -> dict:
+    return {
+        "name": name, "where": where, "strength": strength, "unit": "N m",
+        "ci95": [0.1, 0.3], "strengths": {where: strength},
+    }  # fmt: skip
+
+
 def test_a_wrong_name_counts_only_where_the_verdict_stands_by_it():
     from withheld.scoring import record, scores
 
-    place = {
-        "joint": "hinge", "channel": "body", "strength": {"N m": 0.2}, "places": ["hinge", "motor"]
+    truth = {
+        "name": "coulomb_friction", "joint": "hinge", "channel": "body",
+        "strength": {"N m": 0.2}, "places": ["hinge", "motor"],
     }  # fmt: skip
-    label = {
-        "tier": "T3", "robot": "arm", "form": "same", "engine": "fine", "detectability": 500.0,
-        "excitation": "open", "velocities": True, "runs": 8, "noise_told": True,
-        "truths": [{"name": "coulomb_friction", **place}],
-    }  # fmt: skip
-    found = {
-        "name": "viscous_friction", "where": "hinge", "strength": 0.25, "unit": "N m",
-        "ci95": [0.1, 0.3], "strengths": {"hinge": 0.25},
-    }  # fmt: skip
+    label = _label("T3", "arm", truth)
+    found = _finding("viscous_friction", "hinge", 0.25)
     report = {
         "effects": [found], "confusion_set": ["viscous_friction"], "seconds": 1.0,
         "gap": {"explained_fraction": 0.9, "ci95": [0.8, 0.95]},
@@ -580,15 +588,8 @@ def test_who_names_nothing_has_found_no_place_and_reserve_is_told():
         "name": "coulomb_friction", "joint": "elbow", "channel": "body", "strength": {},
         "places": ["elbow"],
     }  # fmt: skip
-    label = {
-        "tier": "T1", "robot": "two_links", "form": "same", "engine": "fine",
-        "detectability": 500.0, "excitation": "open", "velocities": True, "runs": 8,
-        "noise_told": True, "truths": [truth],
-    }  # fmt: skip
-    effect = {
-        "name": "coulomb_friction", "where": "elbow", "strength": 0.2, "unit": "N m",
-        "ci95": [0.1, 0.3], "strengths": {"elbow": 0.2},
-    }  # fmt: skip
+    label = _label("T1", "two_links", truth)
+    effect = _finding("coulomb_friction", "elbow", 0.2)
     report = {
         "effects": [effect], "confusion_set": ["coulomb_friction", "stribeck_friction"],
         "seconds": 1.0, "where": {"channel": {"body": 0.9, "actuation": 0.1}},

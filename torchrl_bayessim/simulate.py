@@ -17,7 +17,7 @@ __all__ = [
 ]
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +27,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import BaseCollector, Collector
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from .counts import check_count
 from .diverged import UndisturbedPolicy, check_policy
@@ -40,6 +40,7 @@ from .sources import Grid
 from .summaries import SummaryStatistics
 from .trajectories import concatenate, first_trajectories
 from .transforms.domain_randomizer import DomainRandomizer
+from .transforms.resets import simulator
 from .whole_file import replacing_folder
 
 if TYPE_CHECKING:
@@ -102,22 +103,18 @@ def next_batch(
         ) from error
 
 
-@contextmanager
-def _working(collector: Any, meanwhile: Callable[[float], None] | None) -> Iterator[None]:
+def _working(
+    collector: Any, meanwhile: Callable[[float], None] | None
+) -> AbstractContextManager[None]:
     if meanwhile is None:
-        yield
-        return
-    env = getattr(collector, "env", None)
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
+        return nullcontext()
+    env = simulator(getattr(collector, "env", None))
     if not isinstance(env, BatchedMujocoEnv):
         meanwhile(1.0)
-        yield
-        return
+        return nullcontext()
     steps = collector.requested_frames_per_batch // env.batch_size.numel()
     begun = count(1)
-    with env.meanwhile(lambda: meanwhile(next(begun) / steps)):
-        yield
+    return env.meanwhile(lambda: meanwhile(next(begun) / steps))
 
 
 def summaries_in_turn(

@@ -135,6 +135,8 @@ def scores(records: Sequence[Record], *, threshold: float) -> dict[str, Any]:
     tiers = {tier: _tier(tier, records, visible) for tier in sorted({r["tier"] for r in records})}
     known = [r for r in visible if r["tier"] in {"T1", "T2"}]
     strengths = sorted(r["strength_error"] for r in known if "strength_error" in r)
+    sensed = [r for r in known if "channel" in r]
+    placed = [r for r in known if "joint" in r and r["robot"] != "arm"]
     return {
         "threshold": threshold,
         "tiers": tiers,
@@ -145,16 +147,10 @@ def scores(records: Sequence[Record], *, threshold: float) -> dict[str, Any]:
         "by_detectability": _strata(records, "top1_class"),
         "oracle_by_detectability": _strata(records, "oracle_class"),
         "where": {
-            "channel": share(r["channel"] for r in known if "channel" in r),
-            "channel_of_right_class": share(
-                r["channel"] for r in known if "channel" in r and r["top1_class"]
-            ),
-            "joint": share(r["joint"] for r in known if "joint" in r and r["robot"] != "arm"),
-            "joint_of_right_class": share(
-                r["joint"]
-                for r in known
-                if "joint" in r and r["robot"] != "arm" and r["top1_class"]
-            ),
+            "channel": share(r["channel"] for r in sensed),
+            "channel_of_right_class": share(r["channel"] for r in sensed if r["top1_class"]),
+            "joint": share(r["joint"] for r in placed),
+            "joint_of_right_class": share(r["joint"] for r in placed if r["top1_class"]),
         },
         "regime": _regime([r["regime"] for r in known if r.get("regime")]),
         "strength": {
@@ -170,13 +166,11 @@ def scores(records: Sequence[Record], *, threshold: float) -> dict[str, Any]:
 
 def _regime(pairs: Sequence[Mapping[str, float]]) -> dict[str, Any]:
     """Return how well rules overlap with when causes act, beside what no rule would."""
-    n = len(pairs)
-    found: dict[str, Any] = {"n": n, "better_than_no_rule": share(
-        pair["iou"] > pair["of_no_rule"] for pair in pairs
-    )}  # fmt: skip
-    for name in ("iou", "of_no_rule"):
-        found[name] = sum(pair[name] for pair in pairs) / n if n else None
-    return found
+    return {
+        "n": len(pairs),
+        "better_than_no_rule": share(pair["iou"] > pair["of_no_rule"] for pair in pairs),
+        **{name: _mean([pair[name] for pair in pairs]) for name in ("iou", "of_no_rule")},
+    }
 
 
 def uniform(p_values: Sequence[float]) -> dict[str, Any]:
@@ -191,8 +185,7 @@ def _shrinkage(pairs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the error of the predicted shrinkage and the coverage of its interval."""
     errors = [abs(p["predicted"] - p["true"]) for p in pairs]
     covered = share(p["ci95"][0] <= p["true"] <= p["ci95"][1] for p in pairs)
-    mean = sum(errors) / len(errors) if errors else None
-    return {"n": len(pairs), "mae": mean, "ci_cover": covered}
+    return {"n": len(pairs), "mae": _mean(errors), "ci_cover": covered}
 
 
 def _tiers_of(records: Sequence[Record], threshold: float) -> dict[str, Any]:

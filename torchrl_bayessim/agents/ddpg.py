@@ -215,7 +215,7 @@ class DDPG:
         self.state.observe(kept)
         updates = round(self.updates_per_frame * batch.numel())
         self._report = {"loss_actor": 0.0, "loss_critic": 0.0, "updates": float(updates)}
-        self._report["learning_rate"] = self._set_rate(progress)
+        self._report["learning_rate"] = self._set_learning_rate(progress)
         self._owed = OwedUpdates(self._updates(updates, tuple(key)), updates), before
 
     def work(self, share: float) -> None:
@@ -224,8 +224,7 @@ class DDPG:
         They draw nothing from global generators, so this may happen in the midst of what does.
         """
         if self._owed is not None:
-            with torch.enable_grad():  # which collectors switch off
-                self._owed[0].work(share)
+            self._owed[0].work(share)
 
     def finish(self) -> dict[str, float]:
         """Make the updates that are left, and return what `update` does; empty if none was owed.
@@ -237,8 +236,7 @@ class DDPG:
             return {}
         (owed, before), self._owed = self._owed, None
         try:
-            with torch.enable_grad():
-                owed.finish()
+            owed.finish()
         except SimulationError:
             self._learn(before)
             raise
@@ -268,9 +266,10 @@ class DDPG:
         """Make an update at each turn; the report has the means of their losses."""
         sums = {"actor": 0.0, "critic": 0.0}
         for index, steps in enumerate(self._replayed(count, key=key)):
-            sums["critic"] += self._step("critic", self._loss.critic_loss(steps))
-            if (index + 1) % self._actor_every == 0:
-                sums["actor"] += self._step("actor", self._loss.policy_loss(steps))
+            with torch.enable_grad():  # which collectors switch off
+                sums["critic"] += self._step("critic", self._loss.critic_loss(steps))
+                if (index + 1) % self._actor_every == 0:
+                    sums["actor"] += self._step("actor", self._loss.policy_loss(steps))
             self._targets.step()
             made = {"actor": (index + 1) // self._actor_every, "critic": index + 1}
             self._report |= {f"loss_{part}": sums[part] / max(1, made[part]) for part in sums}
@@ -291,7 +290,7 @@ class DDPG:
         self._optimizers[part].step()
         return value
 
-    def _set_rate(self, progress: float) -> float:
+    def _set_learning_rate(self, progress: float) -> float:
         first, last, start = self._rates
         over = min(max((progress - start) / max(1 - start, 1e-9), 0.0), 1.0)
         rate = first + over * (last - first)

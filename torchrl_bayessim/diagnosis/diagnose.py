@@ -233,19 +233,13 @@ def _shapes(system: System, prepared: Prepared, units: Sequence[Unit], point: Po
 
 
 def _system(simulator: str | Task | System, prior: BoxPrior | None) -> System:
-    if isinstance(simulator, System):
-        if prior is not None and simulator.prior is not None:
-            expected = "one prior"
-            raise ValueError(message(expected, "the system's and another", hint="pass None"))
-        if prior is None:
-            return simulator
-        check_kind("a BoxPrior or None", prior, BoxPrior)
-        return replace(simulator, physics=MujocoPhysics(*prior.names), prior=prior)
-    task = as_task(simulator)
-    if prior is not None:
-        check_kind("a BoxPrior or None", prior, BoxPrior)
-    physics = None if prior is None else MujocoPhysics(*prior.names)
-    return System(task=task, physics=physics, prior=prior)
+    system = simulator if isinstance(simulator, System) else System(task=as_task(simulator))
+    if prior is None:
+        return system
+    if system.prior is not None:
+        raise ValueError(message("one prior", "the system's and another", hint="pass None"))
+    check_kind("a BoxPrior or None", prior, BoxPrior)
+    return replace(system, physics=MujocoPhysics(*prior.names), prior=prior)
 
 
 def _effects(

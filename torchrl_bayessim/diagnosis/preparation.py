@@ -10,6 +10,7 @@ __all__ = ["Prepared", "prepare", "split"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import cycle, pairwise
 
 import numpy as np
 import torch
@@ -91,15 +92,13 @@ def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
     parts: dict[str, list[Log]] = {"train": [], "validation": [], "test": []}
     whole, pieces = _whole(logs)
     if len(whole) >= _APART:
-        for i, log in enumerate(_ordered(whole)):
-            parts[_DEAL[i % len(_DEAL)]].append(log)
-        parts["train"] += pieces
-        return parts
-    for log in whole:
-        length = len(log)
-        ends = 0, length // 2, 3 * length // 4, length
-        for name, begin, end in zip(parts, ends, ends[1:], strict=False):
-            parts[name].append(_rows(log, begin, end))
+        for log, name in zip(_ordered(whole), cycle(_DEAL), strict=False):
+            parts[name].append(log)
+    else:
+        for log in whole:
+            ends = 0, len(log) // 2, 3 * len(log) // 4, len(log)
+            for name, (begin, end) in zip(parts, pairwise(ends), strict=True):
+                parts[name].append(_rows(log, begin, end))
     parts["train"] += pieces
     return parts
 
@@ -107,9 +106,7 @@ def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
 def _whole(logs: Sequence[Log]) -> tuple[list[Log], list[Log]]:
     """Return the logs, and those that are pieces, much shorter than the others."""
     least = _PIECE * float(np.median([len(log) for log in logs])) if logs else 0.0
-    short = [len(log) < least for log in logs]
-    whole = [log for log, is_short in zip(logs, short, strict=True) if not is_short]
-    return whole, [log for log, is_short in zip(logs, short, strict=True) if is_short]
+    return [log for log in logs if len(log) >= least], [log for log in logs if len(log) < least]
 
 
 def _ordered(logs: Sequence[Log]) -> list[Log]:

@@ -14,7 +14,7 @@ from .report import Candidate, Finding, Verdict
 from .shrinkage import Shrinkage
 from .validation import NEGLIGIBLE, PARTIAL, SHOWN
 
-_PLACE = 0.2  # of the error, to say that it sits there
+_MUCH = 0.2  # of the error, to say that it sits there
 # what readers know a law by, beside its strength
 _FORMS = {"frequency": ", {:.3g} Hz", "number": ", {:.3g} per turn or 2π m"}
 
@@ -149,7 +149,7 @@ def _no_gap(refit: float) -> str:
 
 def _much(rule: Mapping[str, Any]) -> bool:
     """Return whether a place holds enough of the error to be where it sits."""
-    return bool(rule["share"] >= _PLACE)
+    return bool(rule["share"] >= _MUCH)
 
 
 def _percent(share: float) -> str:
@@ -167,7 +167,7 @@ def _percent(share: float) -> str:
 def _described(effect: Finding) -> str:
     half = (effect.ci95[1] - effect.ci95[0]) / 2
     name = plain(effect.name)
-    law = "".join(text.format(effect.form[k]) for k, text in _FORMS.items() if k in effect.form)
+    law = _law(effect.form)
     if len(effect.strengths) > 1:
         least, most = (pick(effect.strengths.values()) for pick in (min, max))
         if most - least <= 1e-3 * abs(most):
@@ -175,8 +175,15 @@ def _described(effect: Finding) -> str:
             return f"{name} at {len(effect.strengths)} places ({each} each)"
         sizes = f"{least:.3g} to {most:.3g} {effect.unit}, mean {effect.strength:.3g} ± {half:.2g}"
         return f"{name} at {len(effect.strengths)} places ({sizes}{law})"
-    place = "at all at once" if effect.where == "all" else f"at {effect.where}"
-    return f"{name} {place} ({effect.strength:.3g} ± {half:.2g} {effect.unit}{law})"
+    return f"{name} {_place(effect.where)} ({effect.strength:.3g} ± {half:.2g} {effect.unit}{law})"
+
+
+def _law(form: Mapping[str, Any]) -> str:
+    return "".join(text.format(form[name]) for name, text in _FORMS.items() if name in form)
+
+
+def _place(where: str) -> str:
+    return "at all at once" if where == "all" else f"at {where}"
 
 
 def _ruled_out(candidates: Sequence[Candidate]) -> str:
@@ -198,12 +205,10 @@ def _least(candidates: Sequence[Candidate]) -> str:
     single = [c for c in candidates if c.where != "all"]
     shown = [c for c in single if _seen(c)] or [c for c in candidates if _seen(c)]
     worst = max(shown, key=lambda c: c.minimal_detectable_strength or 0.0)
-    place = "at all at once" if worst.where == "all" else f"at {worst.where}"
-    if len({c.where for c in single}) > 1 and len(shown) == len(single):
-        place = "anywhere"
-    law = "".join(text.format(worst.form[k]) for k, text in _FORMS.items() if k in worst.form)
+    everywhere = len({c.where for c in single}) > 1 and len(shown) == len(single)
+    place = "anywhere" if everywhere else _place(worst.where)
     least = f"{worst.minimal_detectable_strength:.2g} {worst.unit}"
-    return f"{plain(worst.name)}{law} above {least} {place}"
+    return f"{plain(worst.name)}{_law(worst.form)} above {least} {place}"
 
 
 def _untested(candidates: Sequence[Candidate]) -> str:

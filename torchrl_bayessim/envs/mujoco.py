@@ -234,8 +234,9 @@ class BatchedMujocoEnv(EnvBase):
         substeps = self.task.frame_skip
         self._time()
         if not self._additions:
-            options = {"substeps": substeps, "outputs": outputs}
-            return self.stepper.rollout(commands, meanwhile=self._work, **options)
+            return self.stepper.rollout(
+                commands, substeps=substeps, outputs=outputs, meanwhile=self._work
+            )
         if self._work is not None:
             self._work()
         added = rollout_with(self.stepper, self._additions.values(), commands, substeps=substeps)
