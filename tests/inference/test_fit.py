@@ -10,11 +10,12 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_bayessim.errors import SimulationError
-from torchrl_bayessim.inference.fit import fit, select_lengthscale, usable_pairs
+from torchrl_bayessim.inference.fit import fit, select_lengthscale
 from torchrl_bayessim.inference.losses import PosteriorLoss
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
 from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
+from torchrl_bayessim.inference.usable_pairs import usable_pairs
 from torchrl_bayessim.randomness import generator
 
 PRIOR = BoxPrior({"mass": (2.0, 6.0), "friction": (0.01, 1.0)}, log=["friction"])

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 __all__ = ["descend"]
 
-import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import count
 from typing import NamedTuple
 
 import torch
@@ -21,15 +21,17 @@ from tqdm.auto import tqdm
 
 from ..errors import SimulationError, message
 from ..randomness import generator
+from .mixtures import component_log_prob
 from .posterior import TRAINING_POINTS, MixtureDensityPosterior
 from .rows import Rows
-from .truncation import TruncatedGaussianMixture
-from .weights import weighted_mean, weights_of
-from .widening import widen
+from .stacked import StackedNetworks
+from .truncation import log_mass
+from .weights import weights_of
 
 _WARM_UP = 0.1  # share of the steps in which the learning rate rises
-_FREE = 0.5  # share of the epochs that do without the box
+_FREE = 0.7  # share of the epochs that do without the box
 _CLIP = 10.0  # of the gradient's norm
+_BETAS = 0.9, 0.95  # squares of gradients are forgotten within a fit of some hundred steps
 
 
 class _Pairs(NamedTuple):
@@ -40,7 +42,7 @@ class _Pairs(NamedTuple):
 
 
 def descend(
-    posterior: MixtureDensityPosterior,
+    posteriors: Sequence[MixtureDensityPosterior],
     train: TensorDictBase | Rows,
     validation: TensorDictBase,
     *,
@@ -49,69 +51,86 @@ def descend(
     lr: float,
     weight_decay: float,
     patience: int,
-    seed: int,
+    seeds: Sequence[int],
     progress: bool,
-) -> tuple[list[float], list[float]]:
-    """Leave the posterior with the parameters of its best epoch; return the losses per epoch.
+) -> list[tuple[list[float], list[float]]]:
+    """Leave each posterior with the parameters of its best epoch; return its losses per epoch.
 
     Args:
-        posterior: Changed in place.
+        posteriors: Changed in place. Several are :func:`.stacked.alike` and have one prior.
         train: Pairs to learn from, or rows of pairs on disk, which are read as they are needed.
         validation: Pairs that say which epoch is the best.
         epochs: At most so many passes.
         batch_size: Pairs per step.
         lr: Highest learning rate.
         weight_decay: Of AdamW.
-        patience: Epochs without improvement after which the box comes in, and then the end.
-        seed: Of the minibatches.
+        patience: Epochs without improvement after which the box comes in, and then the end: of
+            all posteriors.
+        seeds: Of the minibatches, one for each posterior.
         progress: Whether to show a progress bar.
 
     Raises:
-        SimulationError: The loss is not finite.
+        SimulationError: A loss is not finite.
     """
-    pairs, held = _reader(posterior, train), _prepared(posterior, validation)
+    first, size = posteriors[0], len(posteriors)
+    for posterior in posteriors:
+        posterior.network.widening.fill_(1.0)
+    networks = StackedNetworks([posterior.network for posterior in posteriors])
+    pairs, held = _reader(first, train), _prepared(first, validation)
+    held = _Pairs(*(value.expand(size, *value.shape) for value in held))
     batches = math.ceil(len(train) / batch_size)
-    steps = epochs * batches
-    optimizer = torch.optim.AdamW(
-        posterior.parameters(), lr=lr, weight_decay=weight_decay, fused=True
-    )
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _one_cycle(step, steps))
-    shuffle = generator(seed, "minibatches")
-    posterior.network.widening.fill_(1.0)
-    best, best_state, stale = math.inf, copy.deepcopy(posterior.state_dict()), 0
-    truncated = posterior.prior.box is None
-    losses: tuple[list[float], list[float]] = ([], [])
+    step = _stepper(networks, epochs * batches, lr=lr, weight_decay=weight_decay)
+    shuffles = [generator(seed, "minibatches") for seed in seeds]
+    best, kept = torch.full((size,), math.inf), networks.parameters.detach().clone()
+    truncated, stale = first.prior.box is None, 0
+    trace: list[tuple[Tensor, Tensor]] = []
     bar = tqdm(range(epochs), desc="fit", disable=not progress, leave=False, unit="epoch")
     for epoch in bar:
         if not truncated and (epoch >= _FREE * epochs or stale >= patience):
             truncated, stale = True, 0
-        total = 0.0
-        for rows in torch.randperm(len(train), generator=shuffle).chunk(batches):
-            loss = _loss(posterior, pairs(rows), truncated=truncated)
+        total = torch.zeros(size)
+        order = torch.stack([torch.randperm(len(train), generator=g) for g in shuffles])
+        for rows in order.chunk(batches, 1):
+            loss = _loss(first, networks, pairs(rows), truncated=truncated)
             _check_loss(loss)
-            optimizer.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(posterior.parameters(), _CLIP)
-            optimizer.step()
-            schedule.step()
-            total += loss.item() * len(rows) / len(train)
+            loss.sum().backward()
+            step()
+            total += loss.detach().cpu() * (rows.shape[1] / len(train))
         with torch.no_grad():
-            held_out = _loss(posterior, held, truncated=True).item()
-        losses[0].append(total)
-        losses[1].append(held_out)
-        bar.set_postfix(train=f"{total:.2f}", held_out=f"{held_out:.2f}")
-        stale += 1
-        if held_out < best - 1e-4:
-            best, best_state, stale = held_out, copy.deepcopy(posterior.state_dict()), 0
+            held_out = _loss(first, networks, held, truncated=True).cpu()
+        trace.append((total, held_out))
+        bar.set_postfix(train=f"{total.mean():.2f}", held_out=f"{held_out.mean():.2f}")
+        better, stale = held_out < best - 1e-4, stale + 1
+        if better.any():
+            best, stale = torch.where(better, held_out, best), 0
+            networks.copy_into(kept, better)
         if truncated and stale >= patience:
             break
-    posterior.load_state_dict(best_state)
-    widen([posterior], validation)
-    return losses
+    networks.write(kept)
+    learned, held_out = (torch.stack(part).T.tolist() for part in zip(*trace, strict=True))
+    return list(zip(learned, held_out, strict=True))
 
 
-def _one_cycle(step: int, steps: int) -> float:
-    """Return the share of the highest learning rate: a short rise, then half a cosine to 0."""
+def _stepper(
+    networks: StackedNetworks, steps: int, *, lr: float, weight_decay: float
+) -> Callable[[], None]:
+    """Return what makes a step down the gradients, and forgets them."""
+    optimizer = torch.optim.AdamW(
+        [networks.parameters], lr=lr, betas=_BETAS, weight_decay=weight_decay, fused=True
+    )
+    counted = count()
+
+    def step() -> None:
+        networks.clip_gradients(_CLIP)
+        optimizer.param_groups[0]["lr"] = lr * _rate(next(counted), steps)
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=False)  # the layers' are views of it
+
+    return step
+
+
+def _rate(step: int, steps: int) -> float:
+    """Return the share of the highest learning rate."""
     rise = max(1.0, _WARM_UP * steps)
     if step < rise:
         return 0.1 + 0.9 * step / rise
@@ -121,9 +140,11 @@ def _one_cycle(step: int, steps: int) -> float:
 def _reader(
     posterior: MixtureDensityPosterior, pairs: TensorDictBase | Rows
 ) -> Callable[[Tensor], _Pairs]:
-    """Return what gives rows of the pairs: prepared once where all of them are in memory."""
+    """Return what gives rows ``(M, B)``: prepared once where all pairs are in memory."""
     if isinstance(pairs, Rows):
-        return lambda rows: _prepared(posterior, pairs[rows])
+        return lambda rows: _Pairs(
+            *map(torch.stack, zip(*(_prepared(posterior, pairs[own]) for own in rows), strict=True))
+        )
     whole = _prepared(posterior, pairs)
     return lambda rows: _Pairs(*(value[rows] for value in whole))
 
@@ -137,27 +158,26 @@ def _prepared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> _Pai
     return _Pairs(scaled, z, volume, weights_of(pairs).to(z))
 
 
-def _loss(posterior: MixtureDensityPosterior, pairs: _Pairs, *, truncated: bool) -> Tensor:
-    """Return the weighted negative log-density in nats, as `PosteriorLoss` does."""
-    network = posterior.network
-    logits, loc, scale_tril = network.mixture(pairs.scaled)
-    mixture = TruncatedGaussianMixture(
-        logits,
-        loc,
-        scale_tril,
-        posterior.prior.box if truncated else None,
-        diagonal=network.covariance == "diagonal",
-        points=TRAINING_POINTS,
-    )
-    return weighted_mean(pairs.volume - mixture.log_prob(pairs.z), pairs.weight)
+def _loss(
+    posterior: MixtureDensityPosterior, networks: StackedNetworks, pairs: _Pairs, *, truncated: bool
+) -> Tensor:
+    """Return each network's weighted negative log-density in nats, as `PosteriorLoss` does."""
+    logits, loc, scale_tril = (part.double() for part in networks.mixture(pairs.scaled))
+    each = component_log_prob(pairs.z, loc, scale_tril)
+    box = posterior.prior.box
+    if truncated and box is not None:
+        diagonal = posterior.network.covariance == "diagonal" or loc.shape[-1] == 1
+        each = each - log_mass(loc, scale_tril, box, diagonal=diagonal, points=TRAINING_POINTS)
+    log_q = (logits.log_softmax(-1) + each).logsumexp(-1)
+    return ((pairs.volume - log_q) * pairs.weight).sum(-1) / pairs.weight.sum(-1)
 
 
 def _check_loss(loss: Tensor) -> None:
-    if not loss.isfinite():
+    if not loss.isfinite().all():
         raise SimulationError(
             message(
                 "a finite loss",
-                loss.item(),
+                loss[~loss.isfinite()][0].item(),
                 hint="a smaller learning rate, or fewer constant or redundant statistics",
             )
         )

@@ -20,13 +20,12 @@ from torch import Tensor
 
 from ..errors import message
 from ..kinds import check_kind, real_numbers
-from .fit import FitReport, fit, usable_pairs
+from .fit import FitReport, fit, fit_several
 from .physics_posterior import PhysicsPosterior
 from .posterior import MixtureDensityPosterior
 from .priors import Prior
-from .widening import average, widen
-
-_FEWEST = 50  # held-out pairs that choose how wide an average is
+from .usable_pairs import usable_pairs
+from .widening import average
 
 PosteriorMaker = Callable[[Prior, int], MixtureDensityPosterior]
 
@@ -107,9 +106,6 @@ def fit_together(
         seeds: Of the minibatches, one for each network; the split is the first's.
         options: Passed to :func:`.fit.fit`; a seed there takes the place of those above.
 
-    With fewer than 50 pairs held out each network stays as wide as it needs by itself: the few
-    would choose the factor by chance.
-
     Example:
         >>> from torchrl_bayessim.inference.priors import BoxPrior
         >>> prior = BoxPrior({"a": (0.0, 1.0)})
@@ -120,12 +116,9 @@ def fit_together(
         >>> torch.equal(*(network.network.widening for network in networks))
         True
     """
-    shared = {"split_seed": options.get("seed", seeds[0])}
-    reports = fit_apart(networks, pairs, seeds=seeds, **shared | options)
-    held_out = networks[0].held_out
-    if len(networks) > 1 and held_out is not None and len(held_out) >= _FEWEST:
-        widen(networks, held_out)
-    return reports
+    seed = options.pop("seed", None)
+    seeds = seeds if seed is None else [seed] * len(networks)
+    return fit_several(networks, pairs, seeds=seeds, together=True, **options)
 
 
 def pairs_of(theta: Tensor, summary: Tensor) -> TensorDict:

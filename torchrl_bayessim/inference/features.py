@@ -166,7 +166,7 @@ class ResidualFeatures(Features):
         torch.Size([5, 32])
     """
 
-    def __init__(self, dim: int, *, width: int = 128, blocks: int = 2, seed: int = 0) -> None:
+    def __init__(self, dim: int, *, width: int = 96, blocks: int = 2, seed: int = 0) -> None:
         super().__init__()
         for name, value in {"dim": dim, "width": width, "blocks": blocks}.items():
             check_count(name, value)

@@ -2,31 +2,32 @@
 
 from __future__ import annotations
 
-__all__ = ["FitReport", "check_fit_options", "fit", "select_lengthscale", "usable_pairs"]
+__all__ = ["FitReport", "check_fit_options", "fit", "fit_several", "select_lengthscale"]
 
 import copy
 import inspect
-import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
+from tensordict import TensorDictBase
 
 from ..counts import check_count
-from ..errors import SimulationError, message
+from ..errors import message
 from ..kinds import check_choice, check_kind
 from ..randomness import generator
 from ..scalars import check_number
 from .descent import descend
 from .features import FourierFeatures
-from .input_scaling import InputScaling
-from .losses import one_each
 from .posterior import MixtureDensityPosterior
-from .rows import Rows, mapped, parts
+from .rows import Rows, mapped
+from .stacked import alike
+from .usable_pairs import in_floats, rows_that_count, usable_pairs, usable_rows, warn_of
+from .widening import widen
 
 _SEEN = 1000  # summaries kept to compare real ones with
+_FEWEST = 50  # held-out pairs that choose how wide an average is
 _HELD_OUT = 2**14  # pairs are enough to choose an epoch by, and all are held in memory
 
 
@@ -54,64 +55,12 @@ class FitReport:
         return min(self.validation)
 
 
-def usable_pairs(
-    data: TensorDictBase,
-    *,
-    theta_key: NestedKey = "theta",
-    summary_key: NestedKey = "summary",
-) -> tuple[TensorDictBase, int]:
-    """Return the pairs whose parameters and summaries are finite, and how many were dropped.
-
-    Warns of those, and says which of the two are not finite.
-
-    Raises:
-        ValueError: If there are no pairs, or one of the two entries is missing.
-        SimulationError: If none is left.
-    """
-    rows = _usable_rows(data, theta_key, summary_key)
-    return data[rows], len(data) - len(rows)
-
-
-def _usable_rows(data: TensorDictBase, *keys: NestedKey) -> Tensor:
-    for key in keys:
-        if data.get(key, None) is None:
-            found = sorted(map(str, data.keys(include_nested=True)))
-            raise ValueError(message("pairs with an entry", str(key), available=found))
-    if not data.batch_size.numel():
-        raise ValueError(message("at least one pair", "none", hint="simulate some"))
-    finite = torch.cat(
-        [
-            torch.stack([data[part].get(key).isfinite().all(-1) for key in keys], -1)
-            for part in parts(len(data))
-        ]
-    )
-    good = finite.all(-1)
-    if good.all():
-        return good.nonzero().flatten()
-    bad = zip(keys, (~finite).sum(0).tolist(), strict=True)
-    where = "NaN or infinity in " + " and ".join(f"{key} of {rows}" for key, rows in bad if rows)
-    if not finite[:, 0].any():
-        expected, hint = f"finite parameters in {keys[0]!r}", "parameters as they were drawn"
-        raise SimulationError(message(expected, f"{where} of {len(good)} pairs", hint=hint))
-    if not good.any():
-        raise SimulationError(
-            message(
-                "at least one simulation with finite summaries",
-                f"{len(good)} diverged simulations of {len(good)}: {where}",
-                hint="a smaller prior, a smaller time step, or a summary that masks the divergence",
-            )
-        )
-    text = f"{int((~good).sum())} of {len(good)} pairs are not finite: left out ({where})"
-    warnings.warn(text, stacklevel=3)
-    return good.nonzero().flatten()
-
-
 def fit(
     posterior: MixtureDensityPosterior,
     data: TensorDictBase,
     *,
-    epochs: int = 100,
-    batch_size: int = 128,
+    epochs: int = 50,
+    batch_size: int = 64,
     lr: float = 1e-2,
     weight_decay: float = 1e-4,
     validation_fraction: float = 0.1,
@@ -160,43 +109,94 @@ def fit(
         TypeError: The posterior is none, the pairs are not a TensorDict, a count is no whole
             number, or a rate or share no number.
     """
-    if not isinstance(posterior, MixtureDensityPosterior):
-        raise TypeError(message("a MixtureDensityPosterior", type(posterior).__name__))
+    options = {"epochs": epochs, "batch_size": batch_size, "patience": patience, "lr": lr}
+    options |= {"weight_decay": weight_decay, "validation_fraction": validation_fraction}
+    split_seed = seed if split_seed is None else split_seed
+    options |= {"rescale": rescale, "split_seed": split_seed, "progress": progress}
+    return fit_several([posterior], data, seeds=[seed], **options)[0]
+
+
+def fit_several(
+    posteriors: Sequence[MixtureDensityPosterior],
+    data: TensorDictBase,
+    *,
+    seeds: Sequence[int],
+    together: bool = False,
+    **options: Any,
+) -> list[FitReport]:
+    """Do what :func:`fit` does for several posteriors on one split, and return what each did.
+
+    Those that are :func:`.stacked.alike` are fitted at once, in little more time than one.
+
+    Args:
+        posteriors: Changed in place; of the same keys.
+        data: As for :func:`fit`.
+        seeds: Of the minibatches, one for each; the split is the first's, if no other is given.
+        together: Whether their answers will be averaged: all get the factors on deviations that
+            the average needs, see :mod:`.widening`. With fewer than 50 pairs held out each keeps
+            its own: the few would choose them by chance.
+        options: Of :func:`fit`, but for its seed.
+    """
+    options = _defaults() | {"split_seed": seeds[0]} | options
+    _check(posteriors, data, options)
+    first = posteriors[0]
+    keys = (first.theta_key, first.summary_key)
+    data = in_floats(data, *keys).select(*keys, "weight", strict=False)
+    rows = usable_rows(data, *keys)
+    dropped = len(data) - len(rows)
+    rows = rows_that_count(first, Rows(data, rows))
+    order = rows[torch.randperm(len(rows), generator=generator(options["split_seed"], "split"))]
+    share = options["validation_fraction"]
+    held_out = min(max(1, round(share * len(rows))), len(rows) - 2, _HELD_OUT)
+    validation, train = data[order[:held_out]], Rows(data, order[held_out:])
+    for posterior in posteriors:
+        if options["rescale"]:
+            summaries = (part.get(keys[1]) for part in train.parts())
+            scaling = posterior.network.standardize_inputs(summaries)
+            if posterior is first:
+                warn_of(scaling, Rows(data, rows), keys[1])
+        posterior.seen = train[:_SEEN].get(keys[1])
+        posterior.held_out = validation
+    names = "epochs", "batch_size", "lr", "weight_decay", "patience", "progress"
+    settings = {name: options[name] for name in names}
+    train = train if mapped(data) else train[:]
+    traces = []
+    for group, own in _groups(posteriors, seeds):
+        traces += descend(group, train, validation, seeds=own, **settings)
+    averaged = together and len(validation) >= _FEWEST
+    for group in [posteriors] if averaged else [[posterior] for posterior in posteriors]:
+        widen(group, validation)
+    return [FitReport(len(rows), dropped, len(trace[0]), *trace) for trace in traces]
+
+
+def _groups(
+    posteriors: Sequence[MixtureDensityPosterior], seeds: Sequence[int]
+) -> list[tuple[Sequence[MixtureDensityPosterior], Sequence[int]]]:
+    """Return what is fitted at once: all, or each alone."""
+    same = all(p.prior.settings == posteriors[0].prior.settings for p in posteriors)
+    if same and alike([posterior.network for posterior in posteriors]):
+        return [(posteriors, seeds)]
+    return [([posterior], [seed]) for posterior, seed in zip(posteriors, seeds, strict=True)]
+
+
+def _check(
+    posteriors: Sequence[MixtureDensityPosterior], data: TensorDictBase, options: dict[str, Any]
+) -> None:
+    for posterior in posteriors:
+        if not isinstance(posterior, MixtureDensityPosterior):
+            raise TypeError(message("a MixtureDensityPosterior", type(posterior).__name__))
     if not isinstance(data, TensorDictBase):
         raise TypeError(message("pairs in a TensorDict of batch size (N,)", type(data).__name__))
-    check_number("validation_fraction", validation_fraction, above=0.0, below=1.0)
-    check_number("lr", lr, above=0.0)
-    check_number("weight_decay", weight_decay, least=0.0)
-    for name, value in {"epochs": epochs, "batch_size": batch_size, "patience": patience}.items():
-        check_count(name, value)
-    split_seed = seed if split_seed is None else split_seed
-    data = _in_floats(data, posterior.theta_key, posterior.summary_key)
-    keys = (posterior.theta_key, posterior.summary_key)
-    data = data.select(*keys, "weight", strict=False)
-    rows = _usable_rows(data, *keys)
-    dropped = len(data) - len(rows)
-    rows = _check_pairs(posterior, Rows(data, rows))
-    order = rows[torch.randperm(len(rows), generator=generator(split_seed, "split"))]
-    held_out = min(max(1, round(validation_fraction * len(rows))), len(rows) - 2, _HELD_OUT)
-    validation, train = data[order[:held_out]], Rows(data, order[held_out:])
-    if rescale:
-        summaries = (part.get(posterior.summary_key) for part in train.parts())
-        _warn_of(posterior.network.standardize_inputs(summaries), Rows(data, rows), keys[1])
-    posterior.seen = train[:_SEEN].get(posterior.summary_key)
-    posterior.held_out = validation
-    trace = descend(
-        posterior,
-        train if mapped(data) else train[:],
-        validation,
-        epochs=epochs,
-        batch_size=batch_size,
-        lr=lr,
-        weight_decay=weight_decay,
-        patience=patience,
-        seed=seed,
-        progress=progress,
-    )
-    return FitReport(len(rows), dropped, len(trace[0]), *trace)
+    check_number("validation_fraction", options["validation_fraction"], above=0.0, below=1.0)
+    check_number("lr", options["lr"], above=0.0)
+    check_number("weight_decay", options["weight_decay"], least=0.0)
+    for name in ("epochs", "batch_size", "patience"):
+        check_count(name, options[name])
+
+
+def _defaults() -> dict[str, Any]:
+    named = inspect.signature(fit).parameters.values()
+    return {p.name: p.default for p in named if p.kind == p.KEYWORD_ONLY and p.name != "seed"}
 
 
 def check_fit_options(options: Collection[str]) -> None:
@@ -207,91 +207,8 @@ def check_fit_options(options: Collection[str]) -> None:
         TypeError: They are no mapping.
     """
     check_kind("options of fit by name", options, Mapping, Sequence)
-    known = [p.name for p in inspect.signature(fit).parameters.values() if p.kind == p.KEYWORD_ONLY]
     for name in dict(options) if isinstance(options, Mapping) else options:
-        check_choice("an option of fit", name, known)
-
-
-def _in_floats(data: TensorDictBase, *keys: NestedKey) -> TensorDictBase:
-    """Return pairs of batch size ``(N,)``, as floats of which no gradient is asked."""
-    data = data.copy() if data.ndim == 1 else data.reshape(-1)
-    for key in keys:
-        value = data.get(key, None)
-        if value is not None and not isinstance(value, Tensor):
-            raise TypeError(message(f"a tensor in {key!r}", type(value).__name__))
-    if any(value.requires_grad for value in data.values(include_nested=True, leaves_only=True)):
-        data = data.detach()
-    for key in keys:
-        value = data.get(key, None)
-        if value is not None and (value.ndim != 2 or not value.shape[1]):
-            expected = f"vectors in {key!r}, shape (N, size)"
-            raise ValueError(message(expected, tuple(value.shape), hint="unsqueeze(-1)"))
-        if value is not None and value.is_complex():
-            hint = "its real and imaginary parts, or magnitude and phase"
-            raise TypeError(message(f"real numbers in {key!r}", str(value.dtype), hint=hint))
-        if value is not None and not value.is_floating_point():
-            data.set(key, value.to(torch.get_default_dtype()))
-    return data
-
-
-def _warn_of(scaling: InputScaling, pairs: Rows, key: NestedKey) -> None:
-    """Warn of statistics that say nothing, and of pairs that lie absurdly far out."""
-    count = len(scaling.scale)
-    if scaling.scale.isinf().all():
-        text = (
-            f"None of the {count} statistics varies over {len(pairs)} simulations: these data say "
-            "nothing about the parameters, and the posterior is what they were drawn from, the "
-            "prior if it was. Do the parameters reach the simulator, and the statistics see it?"
-        )
-        warnings.warn(text, stacklevel=3)
-    for column in scaling.absurd.nonzero().flatten().tolist()[:3]:
-        values = torch.cat([part.get(key)[:, column] for part in pairs.parts()])
-        row = int((values - scaling.shift[column]).abs().argmax())
-        text = (
-            f"Statistic {column} of pair {int(pairs.index[row])} is {values[row]:.3g}, so far from "
-            f"those of the others that they could not be told apart beside it (median "
-            f"{scaling.shift[column]:.3g}): scaled by the quartiles. Did this simulation diverge?"
-        )
-        warnings.warn(text, stacklevel=3)
-
-
-def _check_pairs(posterior: MixtureDensityPosterior, pairs: Rows) -> Tensor:
-    """Return which rows count, those whose weight is not 0."""
-    pairs = _weighted(pairs)
-    if len(pairs) < 4:
-        raise ValueError(message("at least 4 usable pairs", len(pairs), hint="simulate more"))
-    expected = (len(posterior.prior.names), len(posterior.network.shift))
-    got = tuple(pairs[:1].get(k).shape[-1] for k in (posterior.theta_key, posterior.summary_key))
-    if got != expected:
-        raise ValueError(message("pairs with (D, L) of the posterior, " + str(expected), got))
-    theta = (part.get(posterior.theta_key) for part in pairs.parts())
-    inside = torch.cat([posterior.prior.contains(part) for part in theta])
-    if not inside.all():
-        row = int((~inside).nonzero()[0])
-        first = pairs[row : row + 1].get(posterior.theta_key)[0]
-        raise ValueError(
-            message(
-                f"parameters inside the prior {posterior.prior!r}",
-                f"{int((~inside).sum())} outside it, the first {first.tolist()}",
-                hint="the prior that the parameters were drawn from",
-            )
-        )
-    return pairs.index
-
-
-def _weighted(pairs: Rows) -> Rows:
-    """Return the pairs whose weight is not 0: if only others were held out, none would count."""
-    if "weight" not in pairs.pairs.keys():  # noqa: SIM118
-        return pairs
-    given = torch.cat([part.get("weight") for part in pairs.parts()])
-    weight = one_each("weight", given, pairs.index.shape)
-    if weight.is_complex():
-        raise TypeError(message("weights that are real numbers", str(weight.dtype)))
-    good = weight.isfinite() & (weight >= 0)
-    if not good.all() or not weight.any():
-        text = f"{int((~good).sum())} that are not, sum {weight.sum().item():.3g}"
-        raise ValueError(message("finite weights of 0 or more, some positive", text))
-    return Rows(pairs.pairs, pairs.index[weight > 0])
+        check_choice("an option of fit", name, ["seed", *_defaults()])
 
 
 def select_lengthscale(
@@ -317,7 +234,7 @@ def select_lengthscale(
     if not isinstance(features, FourierFeatures):
         raise TypeError(message("a posterior over FourierFeatures", type(features).__name__))
     key = posterior.summary_key
-    data = _in_floats(data, posterior.theta_key, key)
+    data = in_floats(data, posterior.theta_key, key)
     pairs, _ = usable_pairs(data, theta_key=posterior.theta_key, summary_key=key)
     network.standardize_inputs(pairs[key])
     some = torch.randperm(len(pairs), generator=generator(seed, "median"))[:500]

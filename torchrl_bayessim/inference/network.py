@@ -36,7 +36,7 @@ def melu(z: Tensor) -> Tensor:
         >>> melu(torch.tensor([-40.0, 0.0, 2.0])) > 0
         tensor([True, True, True])
     """
-    return torch.where(z < 0, z.clamp(max=0.0).exp(), z + 1) + FLOOR
+    return z.clamp(max=0.0).exp() + z.relu() + FLOOR
 
 
 class MixtureDensityNetwork(nn.Module):
@@ -54,7 +54,7 @@ class MixtureDensityNetwork(nn.Module):
 
     shift: Tensor
     scale: Tensor
-    widening: Tensor  # of all deviations, where a fit was found too sure
+    widening: Tensor  # of each parameter's deviations, where a fit was found too sure, shape (D,)
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class MixtureDensityNetwork(nn.Module):
             loc.copy_((1.2 * (2 * start.draw(components) - 1)).flatten())
         self.register_buffer("shift", torch.zeros(features.dim))
         self.register_buffer("scale", torch.ones(features.dim))
-        self.register_buffer("widening", torch.ones(()))
+        self.register_buffer("widening", torch.ones(parameters))
 
     def standardize_inputs(self, summaries: Tensor | Iterable[Tensor]) -> InputScaling:
         """Set the input scaling from training summaries ``(N, L)``, or from parts of them.
@@ -116,14 +116,23 @@ class MixtureDensityNetwork(nn.Module):
 
     def mixture(self, scaled: Tensor) -> Mixture:
         """Return the mixture for what :meth:`scaled` made of summaries, ``(*, L)``."""
-        raw = self.head(self.features(scaled))
+        return self.widened(self.raw(scaled), self.widening)
+
+    def raw(self, scaled: Tensor) -> Tensor:
+        """Return the last layer's values, from which :meth:`widened` makes the mixture."""
+        return self.head(self.features(scaled))
+
+    def widened(self, raw: Tensor, widening: Tensor) -> Mixture:
+        """Return the mixture of :meth:`raw` values with these factors on deviations, ``(D,)``."""
         logits, loc, diagonal, lower = raw.split(self.sizes, -1)
-        shape = (*scaled.shape[:-1], self.components, self.parameters_)
+        shape = (*raw.shape[:-1], self.components, self.parameters_)
         loc = self.reach * torch.tanh(loc.reshape(shape) / self.reach)
-        deviation = self.widening * melu(diagonal.reshape(shape)).sqrt()
+        deviation = widening * melu(diagonal.reshape(shape)).sqrt()
         deviation = WIDEST * torch.tanh(deviation / WIDEST)
+        if self.parameters_ == 1:
+            return Mixture(logits, loc, deviation.unsqueeze(-1))
         rows = torch.diag_embed(torch.ones_like(deviation))
-        if self.covariance == "full" and self.parameters_ > 1:
+        if self.covariance == "full":
             below = torch.tril_indices(self.parameters_, self.parameters_, -1)
             slope = lower.reshape(*shape[:-1], -1)
             rows[..., below[0], below[1]] = STEEPEST * torch.tanh(slope / STEEPEST)

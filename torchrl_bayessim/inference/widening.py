@@ -1,54 +1,87 @@
 r"""How wide a fitted posterior, or an average of several, is to be: as held-out pairs like best.
 
-A network is surer of the pairs that it learned from than of others. One factor on all deviations,
-learned from the others, undoes most of it (temperature scaling, Guo et al., 2017,
-arXiv:1706.04599). An average of networks that disagree is wider than each of them already: the
-factor that each would need is too much for it, and the one that it needs may be less than 1.
+A network is surer of the pairs that it learned from than of others, and of a parameter that they
+say nothing about most of all. A factor on the deviations of each parameter, learned from the
+others, undoes most of it (after temperature scaling, Guo et al., 2017, arXiv:1706.04599). An
+average of networks that disagree is wider than each of them already: it may need less than 1.
+
+The factors :math:`f_d` maximise
+
+.. math::
+    \sum_i \log q_f(\theta_i \mid x_i) - \sum_d \log(1 + (\log f_d / s)^2)
+
+over the held-out pairs: they stay near 1 unless the pairs say otherwise, and follow them freely
+where they do, as those of a parameter that nothing is known about must.
 """
 
 from __future__ import annotations
 
 __all__ = ["average", "widen"]
 
+import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize
 from tensordict import TensorDictBase
+from torch import Tensor
 
-from .posterior import MixtureDensityPosterior
+from .posterior import TRAINING_POINTS, MixtureDensityPosterior
 from .truncation import TruncatedGaussianMixture
-from .weights import weighted_mean, weights_of
+from .weights import weights_of
 
-_WIDER = (1.0, 1.05, 1.1, 1.15, 1.2, 1.3, 1.4, 1.5, 1.75, 2.0)
-_NARROWER = (0.7, 0.75, 0.8, 0.85, 0.9, 0.95)
-# the same pairs chose each network's epoch, so they are liked better than others will be
-_RESERVE = 1.05
+_NARROWEST, _WIDEST = 0.5, 10.0
+_NEAR = 0.15  # s: what a hundred pairs leave unsure
 
 
-@torch.no_grad()
-def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase) -> float:
-    """Set the factor on all deviations that makes held-out pairs likeliest; return it.
+def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase) -> Tensor:
+    """Set the factors on deviations that make held-out pairs likeliest; return them, ``(D,)``.
 
     Args:
-        networks: Changed in place; several get the same factor, which suits their average.
+        networks: Changed in place; several get the same factors, which suit their average. One
+            alone is never made surer.
         held_out: Pairs ``{"theta", "summary"[, "weight"]}`` that no network learned from.
     """
-    first, alone = networks[0], len(networks) == 1
+    first = networks[0]
     z = first.prior.standardize(held_out.get(first.theta_key).double())
     weight = weights_of(held_out).to(z)
-    scores = {}
-    for factor in _WIDER if alone else _NARROWER + _WIDER:
-        _set(networks, factor)
-        members = [network.get_dist(held_out.copy()).mixture for network in networks]
-        scores[factor] = weighted_mean(average(members).log_prob(z), weight).item()
-    best = max(scores, key=scores.__getitem__)
-    return _set(networks, best if alone else _RESERVE * best)
+    with torch.no_grad():
+        summary = held_out.get(first.summary_key)
+        raw = [n.network.raw(n.network.scaled(summary)) for n in networks]
 
+    def loss(values: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        log_factors = torch.as_tensor(values).to(z).requires_grad_()
+        q = average([_mixture(n, r, log_factors.exp()) for n, r in zip(networks, raw, strict=True)])
+        penalty = (log_factors / _NEAR).square().log1p().sum() / weight.sum()
+        total = penalty - (q.log_prob(z) * weight).sum() / weight.sum()
+        (gradient,) = torch.autograd.grad(total, log_factors)
+        return total.item(), gradient.double().cpu().numpy()
 
-def _set(networks: Sequence[MixtureDensityPosterior], factor: float) -> float:
+    least = 1.0 if len(networks) == 1 else _NARROWEST
+    size = len(first.prior.names)
+    bounds = [(math.log(least), math.log(_WIDEST))] * size
+    options = {"maxiter": 15, "ftol": 1e-6}
+    found = minimize(
+        loss, np.zeros(size), jac=True, method="L-BFGS-B", bounds=bounds, options=options
+    )
+    factors = torch.as_tensor(found.x).exp()
     for network in networks:
-        network.network.widening.fill_(factor)
-    return factor
+        network.network.widening.copy_(factors)
+    return factors
+
+
+def _mixture(
+    posterior: MixtureDensityPosterior, raw: Tensor, factors: Tensor
+) -> TruncatedGaussianMixture:
+    network = posterior.network
+    return TruncatedGaussianMixture(
+        *network.widened(raw, factors.to(raw)),
+        posterior.prior.box,
+        diagonal=network.covariance == "diagonal",
+        points=TRAINING_POINTS,
+    )
 
 
 def average(members: Sequence[TruncatedGaussianMixture]) -> TruncatedGaussianMixture:

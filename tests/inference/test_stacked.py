@@ -1,0 +1,76 @@
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_bayessim.inference.features import FourierFeatures, NeuralFeatures
+from torchrl_bayessim.inference.fit import fit, fit_several
+from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
+from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.inference.stacked import StackedNetworks, alike
+from torchrl_bayessim.randomness import generator
+
+PRIOR = BoxPrior({"a": (0.0, 1.0), "b": (0.1, 2.0)})
+OPTIONS = {"epochs": 4, "progress": False}
+
+
+def pairs(count=300):
+    theta = PRIOR.sample((count,), generator=generator("theta"))
+    noise = 0.3 * torch.randn(count, 2, generator=generator("noise"))
+    return TensorDict({"theta": theta, "summary": theta + noise}, [count])
+
+
+def posteriors(**options):
+    return [MixtureDensityPosterior(PRIOR, 2, seed=seed, **options) for seed in (0, 1, 2)]
+
+
+@pytest.mark.parametrize("covariance", ["full", "diagonal"])
+@pytest.mark.parametrize("features", ["residual", "neural", "fourier"])
+@pytest.mark.parametrize("on_disk", [False, True])
+def test_networks_fitted_at_once_are_those_fitted_one_by_one(
+    covariance, features, on_disk, tmp_path
+):
+    data = pairs().memmap_(tmp_path) if on_disk else pairs()
+    options = {"covariance": covariance, "features": features}
+    together, apart = posteriors(**options), posteriors(**options)
+    reports = fit_several(together, data, seeds=[5, 6, 7], **OPTIONS)
+    for one, other, report, seed in zip(together, apart, reports, (5, 6, 7), strict=True):
+        alone = fit(other, data, seed=seed, split_seed=5, **OPTIONS)
+        assert report.validation == pytest.approx(alone.validation, abs=1e-4)
+        x = torch.tensor([[0.4, 0.7], [0.9, 0.2]])
+        theta = torch.tensor([[0.3, 0.6], [0.8, 0.5]])
+        got, expected = (p.distribution(x).log_prob(theta) for p in (one, other))
+        torch.testing.assert_close(got, expected, atol=2e-3, rtol=2e-3)
+
+
+def test_the_gradient_of_each_network_is_clipped_by_itself():
+    networks = [posterior.network for posterior in posteriors()[:2]]
+    x = torch.randn(2, 8, 2, generator=generator("x"))
+    stacked = StackedNetworks(networks)
+    weight = torch.tensor([1e3, 1e-3])
+    (stacked.mixture(x).loc.square().mean((1, 2, 3)) * weight).sum().backward()
+    stacked.clip_gradients(0.5)
+    for network, own, factor in zip(networks, x, weight, strict=True):
+        network.zero_grad()
+        (network.mixture(own).loc.square().mean() * factor).backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 0.5)
+    gradient = stacked.parameters.grad
+    assert gradient is not None
+    parts = gradient.split([2 * p.numel() for p in networks[0].parameters()])
+    for part, *own in zip(parts, *(n.parameters() for n in networks), strict=True):
+        for row, parameter in zip(part.view(2, -1), own, strict=True):
+            torch.testing.assert_close(row, parameter.grad.flatten(), rtol=1e-3, atol=1e-7)
+
+
+def test_only_networks_that_differ_in_parameters_alone_are_stacked():
+    first, second, third = (posterior.network for posterior in posteriors())
+    assert alike([first, second, third])
+    diagonal = posteriors(covariance="diagonal")[0].network
+    fewer = posteriors(components=2)[0].network
+    plain = posteriors(compress=False)[0].network
+    narrow = posteriors(features=NeuralFeatures(2, widths=(8,)))[0].network
+    for other in (diagonal, fewer, plain, narrow):
+        assert not alike([first, other])
+    fourier = posteriors(features=FourierFeatures(2))
+    assert not alike([fourier[0].network, fourier[1].network])
+    third.shift.fill_(1.0)
+    assert not alike([first, third])
