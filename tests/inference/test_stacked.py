@@ -2,7 +2,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_bayessim.inference.features import FourierFeatures, NeuralFeatures
+from torchrl_bayessim.inference.features import Features, FourierFeatures, NeuralFeatures
 from torchrl_bayessim.inference.fit import fit, fit_several
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior
@@ -59,6 +59,36 @@ def test_the_gradient_of_each_network_is_clipped_by_itself():
     for part, *own in zip(parts, *(n.parameters() for n in networks), strict=True):
         for row, parameter in zip(part.view(2, -1), own, strict=True):
             torch.testing.assert_close(row, parameter.grad.flatten(), rtol=1e-3, atol=1e-7)
+
+
+@pytest.mark.parametrize("frozen", ["head", "features.first"])
+def test_frozen_layers_stay_as_they_are(frozen):
+    nets = posteriors()
+    for net in nets:
+        net.network.get_submodule(frozen).requires_grad_(False)
+    before = [net.network.get_submodule(frozen).weight.clone() for net in nets]
+    fit_several(nets, pairs(), seeds=[5, 6, 7], **OPTIONS)
+    for net, weight in zip(nets, before, strict=True):
+        assert torch.equal(net.network.get_submodule(frozen).weight, weight)
+
+
+class Normalised(Features):
+    """Features of someone's own, which learn besides by no gradient."""
+
+    def __init__(self):
+        super().__init__()
+        self.dim, self.out_features, self.norm = 2, 2, torch.nn.BatchNorm1d(2)
+
+    def forward(self, x):
+        return self.norm(x)
+
+
+def test_features_of_ones_own_keep_what_they_learned_by_no_gradient():
+    features = Normalised()
+    net = MixtureDensityPosterior(PRIOR, 2, features=features)
+    fit(net, pairs(), **OPTIONS)
+    assert features.norm.num_batches_tracked > 0
+    assert features.norm.running_var.ne(1.0).all()
 
 
 def test_only_networks_that_differ_in_parameters_alone_are_stacked():

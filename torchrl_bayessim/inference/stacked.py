@@ -30,8 +30,8 @@ class StackedNetworks:
         networks: Stay as they are until :meth:`write`.
 
     Attributes:
-        parameters: All parameters in a row, and their gradient, which adds up until it is set to
-            zero.
+        parameters: All parameters that are not frozen, in a row, and their gradient, which adds up
+            until it is set to zero.
 
     Example:
         >>> one, other = (
@@ -54,16 +54,16 @@ class StackedNetworks:
                     layers = [cast("nn.Linear", n.get_submodule(name)) for n in networks]
                     self._module.set_submodule(name, _StackedLinear(layers))
         # one tensor for whoever makes steps, and views of it for the layers
-        layers = list(self._module.parameters())
-        self.parameters = nn.Parameter(parameters_to_vector(layers).detach())
+        self._layers = _learned(self._module)
+        self.parameters = nn.Parameter(parameters_to_vector(self._layers).detach())
         self.parameters.grad = torch.zeros_like(self.parameters)
-        vector_to_parameters(self.parameters.data, layers)
-        for layer, part in zip(layers, self._parts(self.parameters.grad), strict=True):
+        vector_to_parameters(self.parameters.data, self._layers)
+        for layer, part in zip(self._layers, self._parts(self.parameters.grad), strict=True):
             layer.grad = part.view(layer.shape)
 
     def _parts(self, values: Tensor) -> list[Tensor]:
         """Return views of all parameters, or of as many values, by layer, ``(M, P_i)`` each."""
-        sizes = [layer.numel() for layer in self._module.parameters()]
+        sizes = [layer.numel() for layer in self._layers]
         return [part.view(self._size, -1) for part in values.split(sizes)]
 
     def mixture(self, scaled: Tensor) -> Mixture:
@@ -92,10 +92,18 @@ class StackedNetworks:
     @torch.no_grad()
     def write(self, values: Tensor) -> None:
         """Give the networks these values of all parameters."""
-        parts = self._parts(values)
         for row, network in enumerate(self._networks):
-            own = torch.cat([part[row] for part in parts])
-            vector_to_parameters(own, network.parameters())
+            for layer, part in zip(_learned(network), self._parts(values), strict=True):
+                layer.copy_(part[row].view_as(layer))
+        if self._size == 1:  # features of one's own may have learned some, as batch norms do
+            for own, learned in zip(
+                self._networks[0].buffers(), self._module.buffers(), strict=True
+            ):
+                own.copy_(learned)
+
+
+def _learned(module: nn.Module) -> list[nn.Parameter]:
+    return [parameter for parameter in module.parameters() if parameter.requires_grad]
 
 
 class _StackedLinear(nn.Module):
@@ -103,6 +111,8 @@ class _StackedLinear(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.stack([layer.weight.detach() for layer in layers]))
         self.bias = nn.Parameter(torch.stack([layer.bias.detach() for layer in layers]))
+        for mine, its in ((self.weight, layers[0].weight), (self.bias, layers[0].bias)):
+            mine.requires_grad_(its.requires_grad)
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.baddbmm(self.bias.unsqueeze(1), x, self.weight.mT)
@@ -117,6 +127,6 @@ def alike(networks: Sequence[MixtureDensityNetwork]) -> bool:
 
 
 def _settings(network: MixtureDensityNetwork) -> tuple[object, ...]:
-    shapes = [(name, tuple(p.shape)) for name, p in network.named_parameters()]
+    shapes = [(name, tuple(p.shape), p.requires_grad) for name, p in network.named_parameters()]
     inputs = network.shift.tolist(), network.scale.tolist(), network.compress
     return type(network), network.covariance, network.components, network.reach, inputs, shapes
