@@ -4,10 +4,10 @@
 
 One robot after another with parameters drawn from the prior, and one trajectory or a few of each,
 as `posterior_recovery` has them. A single round simulates from the prior and answers for all robots
-at once. Sequential inference simulates for one robot: where its posterior of the round before
-says, with a share from the prior, and corrects by importance weights. Both are the average of two
-networks. Writes result.json, table.md and nats.png, the log-density of all parameters at the truth
-over the prior's against the number of simulations; finished parts are kept in ``out``.
+at once. Sequential inference simulates for one robot: in a smaller box around its posterior of the
+round before, and learns from the pairs of all rounds in it. Both are the average of two networks.
+Writes result.json, table.md and nats.png, the log-density of all parameters at the truth over the
+prior's against the number of simulations; finished parts are kept in ``out``.
 """
 
 from __future__ import annotations

@@ -5,17 +5,19 @@ import pytest
 import torch
 
 from torchrl_bayessim.errors import SimulationError
+from torchrl_bayessim.inference.ensemble import pairs_of
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
-from torchrl_bayessim.inference.sequential import sequential
+from torchrl_bayessim.inference.sequential import CORRECTIONS, _inside, sequential
 from torchrl_bayessim.randomness import generator
 
 BOX = BoxPrior({"theta": (-2.0, 2.0)})
 OBSERVED = torch.ones(1, 1)
 # patience as long as the fit, so that the cosine of the learning rate reaches its end
 FIT = {"epochs": 50, "patience": 50, "batch_size": 500, "lr": 5e-3, "progress": False}
+FIT_ROUNDS = {"epochs": 60, "progress": False}
 QUICK = {"epochs": 2, "batch_size": 64, "progress": False}
-every_correction = pytest.mark.parametrize("correction", ["importance", "truncated", "analytic"])
+every_correction = pytest.mark.parametrize("correction", CORRECTIONS)
 
 
 def square(key, sd=0.2):
@@ -156,6 +158,7 @@ def test_rounds_belong_to_the_caller_and_later_ones_simulate_where_the_posterior
         OBSERVED,
         rounds=100,
         simulations=500,
+        correction="importance",
         networks=1,
         **FIT | {"batch_size": 50},
     )
@@ -232,6 +235,51 @@ def test_an_unknown_correction_is_refused():
     rounds = sequential(square(0), BOX, OBSERVED, rounds=1, simulations=9, correction="snpe")
     with pytest.raises(ValueError, match=r"expected a correction.*snpe.*importance.*truncated"):
         next(rounds)
+
+
+NORMAL = GaussianPrior({"theta": (1.0, 2.0)})
+
+
+@pytest.mark.parametrize(
+    ("prior", "make", "error", "text"),
+    [
+        (NORMAL, None, TypeError, "expected a BoxPrior, of which .*got 'GaussianPrior'. Try: anot"),
+        (BOX, lambda size: MixtureDensityPosterior(BOX, size), ValueError, "default networks.*Try"),
+    ],
+)
+def test_focused_rounds_need_boxes_and_the_default_networks(prior, make, error, text):
+    options = {"rounds": 1, "simulations": 9, "make_posterior": make}
+    with pytest.raises(error, match=text):
+        next(sequential(square(0), prior, OBSERVED, correction="focused", **options))
+    usual = next(sequential(square(0), prior, OBSERVED, **options, **QUICK))
+    assert usual.posterior.prior is prior or make is not None
+
+
+def test_focused_rounds_use_the_pairs_of_every_round_that_lie_in_the_last_box():
+    """x = theta to a hundredth: rounds resolve what one round over the whole prior cannot."""
+    asked = []
+
+    def simulator(theta):
+        asked.append(theta)
+        return theta + 0.01 * torch.randn(theta.shape, generator=generator("sharp", len(asked)))
+
+    rounds = list(sequential(simulator, BOX, OBSERVED, rounds=3, simulations=300, **FIT_ROUNDS))
+    last = rounds[-1]
+    box = last.posterior.prior
+    inside = torch.cat([box.contains(theta) for theta in asked])
+    assert last.fit.pairs == inside.sum().item() == last.effective_pairs > 300
+    assert (box.high - box.low).item() < 1.0
+    assert last.posterior.mean.item() == pytest.approx(1.0, abs=0.004)
+    assert last.posterior.stddev.item() == pytest.approx(0.01, rel=0.25)
+    assert abs(rounds[0].posterior.stddev.item() / 0.01 - 1) > 0.3
+
+
+def test_pairs_of_a_round_that_drew_from_less_than_the_box_are_left_out():
+    theta = torch.linspace(-1, 1, 9)[:, None]
+    narrow, wide = BoxPrior({"theta": (-0.5, 0.5)}), BoxPrior({"theta": (-1.5, 1.5)})
+    history = [(BOX, pairs_of(theta, theta)), (narrow, pairs_of(theta / 2, theta))]
+    assert len(_inside(history, wide)) == 9
+    assert len(_inside(history, narrow)) == 5 + 9
 
 
 @pytest.mark.parametrize(

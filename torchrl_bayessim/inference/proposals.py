@@ -1,8 +1,13 @@
 r"""Simulating where the posterior is, and correcting for it.
 
 Pairs drawn from a proposal :math:`\tilde p(\theta)` instead of the prior would teach the network
-:math:`\tilde p(\theta \mid x)`. Three corrections, the first two right for any proposal:
+:math:`\tilde p(\theta \mid x)`. Four corrections, ``"importance"`` and ``"truncated"`` right for
+any proposal:
 
+* ``"focused"``: a smaller box around the posterior, in which pairs of all rounds are as uniform as
+  under the prior and need no weights; the posterior is learned over that box alone. Weights,
+  where few of the prior's pairs lie near the posterior, leave those that do next to nothing of
+  the loss.
 * ``"importance"``: weights :math:`w = p(\theta) / \tilde p(\theta)` in the loss, with
   :math:`\tilde p = \sum_r \tfrac{n_r}{N} \tilde p_r` over all rounds (the balance heuristic, Veach
   & Guibas, 1995). If the prior is part of every proposal, the weights are bounded.

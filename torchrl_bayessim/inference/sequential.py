@@ -11,14 +11,14 @@ __all__ = ["Correction", "SequentialRound", "sequential"]
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ..counts import check_count
-from ..errors import SimulationError
+from ..errors import SimulationError, message
 from ..kinds import check_choice, check_function
 from ..randomness import seed_from
 from ..sources import Defensive, check_prior_share, draw
@@ -27,17 +27,19 @@ from .fit import FitReport, check_fit_options
 from .misspecification import doubts
 from .physics_posterior import PhysicsPosterior
 from .posterior import MixtureDensityPosterior
-from .priors import Prior, check_prior
+from .priors import BoxPrior, Prior, check_prior
 from .proposals import (
     HighestDensityPrior,
     Proposal,
     analytic_correction,
     effective_sample_size,
+    focus,
     gaussian_proposal,
     importance_weights,
 )
 
-Correction = Literal["importance", "truncated", "analytic"]
+Correction = Literal["focused", "importance", "truncated", "analytic"]
+CORRECTIONS = get_args(Correction)
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ def sequential(
     *,
     rounds: int,
     simulations: int,
-    correction: Correction = "importance",
+    correction: Correction | None = None,
     prior_share: float = 0.2,
     networks: int = 2,
     make_posterior: Callable[[int], MixtureDensityPosterior] | None = None,
@@ -84,13 +86,17 @@ def sequential(
         observed: Summaries of the real trajectories, ``(n, L)``, or of one, ``(L,)``.
         rounds: Number of rounds.
         simulations: Simulations per round.
-        correction: See :mod:`.proposals`. ``"importance"`` and ``"truncated"`` train on the pairs
-            of all rounds; ``"analytic"`` on the last round's, and if it has to refuse a
-            division, warns and goes on with the posterior before.
-        prior_share: Share of the draws from the prior that is kept in every proposal.
+        correction: See :mod:`.proposals`. ``"focused"``, the default under a box prior, draws from
+            ever smaller boxes around the posterior and trains on the pairs of all rounds that lie
+            in the last one: those are uniform there and count alike. ``"importance"``, the default
+            otherwise, and ``"truncated"`` train on the pairs of all rounds, weighted;
+            ``"analytic"`` on the last round's, and if it has to refuse a division, warns and goes
+            on with the posterior before.
+        prior_share: Share of the draws from the prior that is kept in every proposal but boxes.
         networks: Networks fitted each round; the posterior is their average, which is less sure
             where they disagree: see :mod:`.ensemble`.
-        make_posterior: Summary size to a fresh network; a default one if omitted.
+        make_posterior: Summary size to a fresh network; a default one if omitted. It is one over
+            the whole prior, so ``"importance"`` is the default correction with it.
         seed: Same seed, same rounds (if the simulator is deterministic).
         **fit_options: Passed to :func:`.fit.fit`.
 
@@ -99,11 +105,12 @@ def sequential(
 
     Raises:
         TypeError: On the first turn, for counts that are no whole numbers, a prior that is none of
-            :mod:`.priors`, a simulator that is no function, or ``observed`` that is not made of
-            numbers.
-        ValueError: On the first turn, for an unknown correction or option, counts that are too
-            small, a share that is no probability, ``observed`` that is not finite, or a simulator
-            that does not give one summary per simulation.
+            :mod:`.priors`, or no box for ``"focused"``, a simulator that is no function, or
+            ``observed`` that is not made of numbers.
+        ValueError: On the first turn, for an unknown correction or option, ``"focused"`` with
+            networks of one's own, counts that are too small, a share that is no probability,
+            ``observed`` that is not finite, or a simulator that does not give one summary per
+            simulation.
 
     Warns if the real summaries lie apart from all simulated ones, or the posterior at an edge: see
     :mod:`.misspecification`.
@@ -111,11 +118,11 @@ def sequential(
     check_count("rounds", rounds)
     check_count("simulations", simulations, least=4)
     check_count("networks", networks)
-    check_choice("a correction", correction, ["importance", "truncated", "analytic"])
     check_function("a simulator, a function of parameters (N, D)", simulator)
     if make_posterior is not None:
         check_function("make_posterior, a function of the summary's size", make_posterior)
     check_prior(prior)
+    correction = _correction(correction, prior, given_networks=make_posterior is not None)
     check_prior_share(prior_share)
     check_fit_options(fit_options)
     observed = real_summaries(observed)
@@ -127,10 +134,15 @@ def sequential(
         history.append((proposal, pairs_of(theta, simulator(theta))))
         if correction == "analytic":  # more of one proposal after a refusal
             history = [entry for entry in history if entry[0] is proposal]
-        pairs = _pairs(history, prior, weighted=correction != "analytic")
+        focused = correction == "focused"
+        pairs = (
+            _inside(history, proposal)
+            if focused
+            else _pairs(history, prior, weighted=correction != "analytic")
+        )
         learned, report = learn(
             pairs,
-            prior,
+            proposal if focused else prior,
             observed,
             make_posterior=MixtureDensityPosterior
             if make_posterior is None
@@ -163,6 +175,31 @@ def _divided(
     return posterior, repaired + dropped, False
 
 
+def _correction(given: Correction | None, prior: Prior, *, given_networks: bool) -> Correction:
+    if given is not None:
+        check_choice("a correction", given, CORRECTIONS)
+    if given != "focused":
+        usual = "focused" if isinstance(prior, BoxPrior) and not given_networks else "importance"
+        return given or usual
+    if not isinstance(prior, BoxPrior):
+        expected = "a BoxPrior, of which focused rounds take smaller boxes"
+        raise TypeError(message(expected, type(prior).__name__, hint="another correction"))
+    if given_networks:
+        expected = "the default networks, which focused rounds make over smaller boxes"
+        raise ValueError(message(expected, "make_posterior", hint="another correction"))
+    return given
+
+
+def _inside(history: list[tuple[Any, TensorDict]], box: BoxPrior) -> TensorDictBase:
+    """Return the pairs in a box of all rounds that drew from the whole of it, each of weight 1."""
+    kept = []
+    for drawn_from, pairs in history:
+        if (drawn_from.low <= box.low).all() and (drawn_from.high >= box.high).all():
+            kept.append(pairs[box.contains(pairs["theta"])])
+    found: Any = torch.cat(kept)
+    return found.set("weight", torch.ones(len(found)))
+
+
 def _pairs(
     history: list[tuple[Proposal, TensorDict]], prior: Prior, *, weighted: bool
 ) -> TensorDictBase:
@@ -179,6 +216,8 @@ def _next_proposal(
 ) -> Any:
     if correction == "analytic":
         return gaussian_proposal(posterior)
+    if correction == "focused":
+        return focus(cast("BoxPrior", prior), posterior)
     if correction == "truncated":
         return Defensive(HighestDensityPrior(prior, posterior), prior, prior_share)
     return Defensive(posterior, prior, prior_share)
