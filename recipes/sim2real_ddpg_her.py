@@ -173,7 +173,7 @@ class Run:
         robot_env = task.make(settings.episodes, seed=seed, randomizer=None)
         place = {"seed": seed, "workers": settings.workers}
         self.collectors = collectors(settings.collector, task, self.learner.policy, **place)
-        epochs = 40 if settings.short else 300
+        epochs = 20 if settings.short else 150
         self.loop = SimToRealLoop(
             self.env,
             self.learner,

@@ -180,10 +180,8 @@ def test_the_parameters_of_the_best_epoch_are_kept(options):
     net, data = posterior(), linear_gaussian(60)
     report = short_fit(net, data, **{"lr": 0.05, "batch_size": 16} | options)
     order = torch.randperm(60, generator=generator(0, "split"))
-    with torch.no_grad():
-        kept = PosteriorLoss(net)(data[order[:6]])["loss_posterior"].item()
-    net.network.widening.fill_(1.0)  # chosen afterwards
-    assert kept <= report.best + 2e-4
+    assert (net.network.widening > 1.0).all()  # chosen afterwards, of a network alone
+    net.network.widening.fill_(1.0)
     with torch.no_grad():
         kept = PosteriorLoss(net)(data[order[:6]])["loss_posterior"].item()
     assert kept == pytest.approx(report.best, abs=2e-4)

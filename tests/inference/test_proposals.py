@@ -11,12 +11,12 @@ from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
 from torchrl_bayessim.inference.proposals import (
     HighestDensityPrior,
     analytic_correction,
-    effective_sample_size,
     focus,
     gaussian_proposal,
     importance_weights,
 )
 from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
+from torchrl_bayessim.inference.weights import effective_sample_size
 from torchrl_bayessim.sources import Defensive, draw
 
 BOX = BoxPrior({"theta": (-2.0, 2.0)})
@@ -336,3 +336,18 @@ def test_the_gaussian_proposal_spans_all_modes():
     assert (sd * unit) ** 2 == pytest.approx(variance, rel=0.02)
     wider = gaussian_proposal(posterior, inflate=2.0).mixture.scale_tril.item()
     assert wider == pytest.approx(2 * sd, rel=1e-4)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_posterior_that_its_box_cuts_off_is_looked_for_beyond(side):
+    """Prior [-2, 2], last box [-0.5, 0.5], and a narrow posterior at one of its edges."""
+    prior = BoxPrior({"a": (-2.0, 2.0)})
+    last = prior.within(torch.tensor([-0.5]), torch.tensor([0.5]))
+    edge = last.box[1] if side > 0 else last.box[0]
+    narrow = TruncatedGaussianMixture(
+        torch.zeros(1), edge[None].float(), 0.02 * torch.eye(1)[None], last.box, diagonal=True
+    )
+    found = focus(prior, PhysicsPosterior(narrow, last))
+    far, near = (found.high, found.low) if side > 0 else (found.low, found.high)
+    assert (side * far).item() == pytest.approx(1.5, abs=0.05)
+    assert 0.3 < (side * near).item() < 0.5

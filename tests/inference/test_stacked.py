@@ -2,8 +2,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_bayessim.inference.descent import descend
 from torchrl_bayessim.inference.features import Features, FourierFeatures, NeuralFeatures
 from torchrl_bayessim.inference.fit import fit, fit_several
+from torchrl_bayessim.inference.losses import PosteriorLoss
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.inference.stacked import StackedNetworks, alike
@@ -53,7 +55,7 @@ def test_the_gradient_of_each_network_is_clipped_by_itself():
         network.zero_grad()
         (network.mixture(own).loc.square().mean() * factor).backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 0.5)
-    gradient = stacked.parameters.grad
+    gradient = stacked.parameters[0].grad
     assert gradient is not None
     parts = gradient.split([2 * p.numel() for p in networks[0].parameters()])
     for part, *own in zip(parts, *(n.parameters() for n in networks), strict=True):
@@ -83,12 +85,35 @@ class Normalised(Features):
         return self.norm(x)
 
 
-def test_features_of_ones_own_keep_what_they_learned_by_no_gradient():
+def test_features_of_ones_own_keep_what_they_had_learned_at_the_best_epoch():
     features = Normalised()
     net = MixtureDensityPosterior(PRIOR, 2, features=features)
-    fit(net, pairs(), **OPTIONS)
-    assert features.norm.num_batches_tracked > 0
-    assert features.norm.running_var.ne(1.0).all()
+    report = fit(net, pairs(60), epochs=40, lr=0.1, progress=False)
+    best = min(range(report.epochs), key=report.validation.__getitem__)
+    assert 0 < best < report.epochs - 1
+    # one step and one look at the held-out pairs an epoch, and one to choose how wide it is to be
+    assert features.norm.num_batches_tracked == 2 * (best + 1) + 1
+
+
+class Doubled(Features):
+    """Features of someone's own that calculate in double precision."""
+
+    def __init__(self):
+        super().__init__()
+        self.dim, self.out_features = 2, 4
+        self.weight = torch.nn.Parameter(torch.ones(4, 2, dtype=torch.float64).T)
+
+    def forward(self, x):
+        self.last = (x.double() @ self.weight).float()
+        return self.last
+
+
+def test_features_of_ones_own_may_be_of_any_make():
+    nets = posteriors(features=Doubled())
+    fit(nets[0], pairs(), **OPTIONS)
+    before = nets[0].network.features.weight.clone()
+    fit(nets[0], pairs(), **OPTIONS)
+    assert nets[0].network.features.weight.ne(before).any()
 
 
 def test_only_networks_that_differ_in_parameters_alone_are_stacked():
@@ -100,7 +125,47 @@ def test_only_networks_that_differ_in_parameters_alone_are_stacked():
     narrow = posteriors(features=NeuralFeatures(2, widths=(8,)))[0].network
     for other in (diagonal, fewer, plain, narrow):
         assert not alike([first, other])
+    other, again = posteriors()[:2]
+    other.network.features.blocks[0] = torch.nn.Sequential(torch.nn.Tanh())
+    assert not alike([first, other.network])
+    again.network.head.register_forward_hook(lambda *_: None)
+    assert not alike([first, again.network])
+    assert not alike([first, first])
+    assert not alike([first, posteriors()[0].network.double()])
     fourier = posteriors(features=FourierFeatures(2))
     assert not alike([fourier[0].network, fourier[1].network])
     third.shift.fill_(1.0)
     assert not alike([first, third])
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"seeds": [1]}, "posteriors, and as many seeds, got '3 and 1'"),
+        ({"epoch": 1}, "an option of fit, got 'epoch'.*did you mean"),
+    ],
+)
+def test_what_cannot_be_fitted_together_is_refused(options, text):
+    with pytest.raises(ValueError, match=text):
+        fit_several(posteriors(), pairs(), **{"seeds": [1, 2, 3]} | options)
+    other = MixtureDensityPosterior(PRIOR, 2, in_key="x")
+    with pytest.raises(ValueError, match=r"posteriors of the same keys, got .*'x'"):
+        fit_several([*posteriors()[:2], other], pairs(), seeds=[1, 2, 3])
+
+
+def test_a_short_fit_ends_with_the_loss_itself():
+    nets, data = posteriors()[:2], pairs()
+    options = {"batch_size": 32, "lr": 1e-2, "weight_decay": 0.0, "patience": 9, "progress": False}
+    found = descend(nets, data, data, epochs=1, seeds=[0, 1], **options)
+    for net, (_, validation) in zip(nets, found, strict=True):
+        assert PosteriorLoss(net)(data)["loss_posterior"].item() == pytest.approx(
+            validation[0], abs=1e-4
+        )
+
+
+def test_states_of_one_factor_for_all_parameters_are_understood():
+    net = posteriors()[0]
+    state = net.state_dict()
+    name = next(key for key in state if key.endswith("widening"))
+    net.load_state_dict(state | {name: torch.tensor(1.25)})
+    assert net.network.widening.tolist() == [1.25, 1.25]

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from torchrl_bayessim.inference.ensemble import fit_together
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
-from torchrl_bayessim.inference.priors import GaussianPrior
+from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
 from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
 from torchrl_bayessim.inference.widening import average, widen
 from torchrl_bayessim.randomness import generator
@@ -131,3 +131,25 @@ def test_the_average_has_the_mean_density():
     expected = (one.log_prob(z).exp() + two.log_prob(z).exp()) / 2
     torch.testing.assert_close(average([one, two]).log_prob(z).exp(), expected)
     assert average([one]) is one
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_the_unit_of_the_weights_does_not_matter(unit):
+    pairs = held_out(100)
+    expected = widen([sure(DEVIATION / 1.5)], pairs)
+    pairs["weight"] = torch.full((100,), unit)
+    torch.testing.assert_close(widen([sure(DEVIATION / 1.5)], pairs), expected)
+    assert expected > 1.2
+
+
+def test_pairs_on_the_rim_do_not_hide_how_sure_the_others_find_it():
+    prior = BoxPrior({"a": (1.0, 1.05)}, log=["a"])
+    theta = torch.cat([torch.full((1, 1), 1.0 - 5e-7), torch.linspace(1.0, 1.05, 199)[:, None]])
+    pairs = TensorDict({"theta": theta, "summary": torch.zeros(200, 1)}, [200])
+    network = MixtureDensityPosterior(prior, 1, components=1)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.zero_()
+        network.network.head.bias.copy_(torch.tensor([0.0, 0.0, -4.0]))
+    assert prior.contains(theta).all()
+    assert widen([network], pairs) > 2

@@ -24,7 +24,7 @@ from ..randomness import generator
 from .mixtures import component_log_prob
 from .posterior import TRAINING_POINTS, MixtureDensityPosterior
 from .rows import Rows
-from .stacked import StackedNetworks
+from .stacked import OneNetwork, StackedNetworks, as_one
 from .truncation import log_mass
 from .weights import weights_of
 
@@ -75,18 +75,18 @@ def descend(
     first, size = posteriors[0], len(posteriors)
     for posterior in posteriors:
         posterior.network.widening.fill_(1.0)
-    networks = StackedNetworks([posterior.network for posterior in posteriors])
+    networks = as_one([posterior.network for posterior in posteriors])
     pairs, held = _reader(first, train), _prepared(first, validation)
     held = _Pairs(*(value.expand(size, *value.shape) for value in held))
     batches = math.ceil(len(train) / batch_size)
     step = _stepper(networks, epochs * batches, lr=lr, weight_decay=weight_decay)
     shuffles = [generator(seed, "minibatches") for seed in seeds]
-    best, kept = torch.full((size,), math.inf), networks.parameters.detach().clone()
+    best = torch.full((size,), math.inf)
     truncated, stale = first.prior.box is None, 0
     trace: list[tuple[Tensor, Tensor]] = []
     bar = tqdm(range(epochs), desc="fit", disable=not progress, leave=False, unit="epoch")
     for epoch in bar:
-        if not truncated and (epoch >= _FREE * epochs or stale >= patience):
+        if not truncated and (epoch >= min(_FREE * epochs, epochs - 1) or stale >= patience):
             truncated, stale = True, 0
         total = torch.zeros(size)
         order = torch.stack([torch.randperm(len(train), generator=g) for g in shuffles])
@@ -103,20 +103,20 @@ def descend(
         better, stale = held_out < best - 1e-4, stale + 1
         if better.any():
             best, stale = torch.where(better, held_out, best), 0
-            networks.copy_into(kept, better)
+            networks.keep(better)
         if truncated and stale >= patience:
             break
-    networks.write(kept)
+    networks.restore()
     learned, held_out = (torch.stack(part).T.tolist() for part in zip(*trace, strict=True))
     return list(zip(learned, held_out, strict=True))
 
 
 def _stepper(
-    networks: StackedNetworks, steps: int, *, lr: float, weight_decay: float
+    networks: OneNetwork | StackedNetworks, steps: int, *, lr: float, weight_decay: float
 ) -> Callable[[], None]:
     """Return what makes a step down the gradients, and forgets them."""
     optimizer = torch.optim.AdamW(
-        [networks.parameters], lr=lr, betas=_BETAS, weight_decay=weight_decay, fused=True
+        networks.parameters, lr=lr, betas=_BETAS, weight_decay=weight_decay, fused=True
     )
     counted = count()
 
@@ -124,7 +124,7 @@ def _stepper(
         networks.clip_gradients(_CLIP)
         optimizer.param_groups[0]["lr"] = lr * _rate(next(counted), steps)
         optimizer.step()
-        optimizer.zero_grad(set_to_none=False)  # the layers' are views of it
+        networks.zero_gradients()
 
     return step
 
@@ -159,7 +159,11 @@ def _prepared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> _Pai
 
 
 def _loss(
-    posterior: MixtureDensityPosterior, networks: StackedNetworks, pairs: _Pairs, *, truncated: bool
+    posterior: MixtureDensityPosterior,
+    networks: OneNetwork | StackedNetworks,
+    pairs: _Pairs,
+    *,
+    truncated: bool,
 ) -> Tensor:
     """Return each network's weighted negative log-density in nats, as `PosteriorLoss` does."""
     logits, loc, scale_tril = (part.double() for part in networks.mixture(pairs.scaled))
@@ -167,6 +171,7 @@ def _loss(
     box = posterior.prior.box
     if truncated and box is not None:
         diagonal = posterior.network.covariance == "diagonal" or loc.shape[-1] == 1
+        box = box[0].to(loc), box[1].to(loc)
         each = each - log_mass(loc, scale_tril, box, diagonal=diagonal, points=TRAINING_POINTS)
     log_q = (logits.log_softmax(-1) + each).logsumexp(-1)
     return ((pairs.volume - log_q) * pairs.weight).sum(-1) / pairs.weight.sum(-1)

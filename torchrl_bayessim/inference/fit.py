@@ -24,6 +24,7 @@ from .posterior import MixtureDensityPosterior
 from .rows import Rows, mapped
 from .stacked import alike
 from .usable_pairs import in_floats, rows_that_count, usable_pairs, usable_rows, warn_of
+from .weights import effective_sample_size, weights_of
 from .widening import widen
 
 _SEEN = 1000  # summaries kept to compare real ones with
@@ -111,7 +112,6 @@ def fit(
     """
     options = {"epochs": epochs, "batch_size": batch_size, "patience": patience, "lr": lr}
     options |= {"weight_decay": weight_decay, "validation_fraction": validation_fraction}
-    split_seed = seed if split_seed is None else split_seed
     options |= {"rescale": rescale, "split_seed": split_seed, "progress": progress}
     return fit_several([posterior], data, seeds=[seed], **options)[0]
 
@@ -133,19 +133,27 @@ def fit_several(
         data: As for :func:`fit`.
         seeds: Of the minibatches, one for each; the split is the first's, if no other is given.
         together: Whether their answers will be averaged: all get the factors on deviations that
-            the average needs, see :mod:`.widening`. With fewer than 50 pairs held out each keeps
+            the average needs, see :mod:`.widening`. With fewer than 50 effective pairs held out
+            each keeps
             its own: the few would choose them by chance.
-        options: Of :func:`fit`, but for its seed.
+        options: Of :func:`fit`, but for its seed; the patience is that of all of them.
+
+    Raises:
+        ValueError: As :func:`fit`, no posterior, other keys of some, or not one seed for each.
+        SimulationError: As :func:`fit`.
+        TypeError: As :func:`fit`.
     """
-    options = _defaults() | {"split_seed": seeds[0]} | options
-    _check(posteriors, data, options)
+    check_fit_options(options)
+    options = _defaults() | options
+    _check(posteriors, seeds, data, options)
     first = posteriors[0]
     keys = (first.theta_key, first.summary_key)
+    split_seed = seeds[0] if options["split_seed"] is None else options["split_seed"]
     data = in_floats(data, *keys).select(*keys, "weight", strict=False)
-    rows = usable_rows(data, *keys)
+    rows = usable_rows(data, *keys, stacklevel=4)
     dropped = len(data) - len(rows)
-    rows = rows_that_count(first, Rows(data, rows))
-    order = rows[torch.randperm(len(rows), generator=generator(options["split_seed"], "split"))]
+    rows, *_ = [rows_that_count(posterior, Rows(data, rows)) for posterior in posteriors]
+    order = rows[torch.randperm(len(rows), generator=generator(split_seed, "split"))]
     share = options["validation_fraction"]
     held_out = min(max(1, round(share * len(rows))), len(rows) - 2, _HELD_OUT)
     validation, train = data[order[:held_out]], Rows(data, order[held_out:])
@@ -163,7 +171,7 @@ def fit_several(
     traces = []
     for group, own in _groups(posteriors, seeds):
         traces += descend(group, train, validation, seeds=own, **settings)
-    averaged = together and len(validation) >= _FEWEST
+    averaged = together and effective_sample_size(weights_of(validation)) >= _FEWEST
     for group in [posteriors] if averaged else [[posterior] for posterior in posteriors]:
         widen(group, validation)
     return [FitReport(len(rows), dropped, len(trace[0]), *trace) for trace in traces]
@@ -180,11 +188,20 @@ def _groups(
 
 
 def _check(
-    posteriors: Sequence[MixtureDensityPosterior], data: TensorDictBase, options: dict[str, Any]
+    posteriors: Sequence[MixtureDensityPosterior],
+    seeds: Sequence[int],
+    data: TensorDictBase,
+    options: dict[str, Any],
 ) -> None:
+    if not posteriors or len(seeds) != len(posteriors):
+        got = f"{len(posteriors)} and {len(seeds)}"
+        raise ValueError(message("posteriors, and as many seeds", got))
     for posterior in posteriors:
         if not isinstance(posterior, MixtureDensityPosterior):
             raise TypeError(message("a MixtureDensityPosterior", type(posterior).__name__))
+    keys = {(posterior.theta_key, posterior.summary_key) for posterior in posteriors}
+    if len(keys) > 1:
+        raise ValueError(message("posteriors of the same keys", sorted(map(str, keys))))
     if not isinstance(data, TensorDictBase):
         raise TypeError(message("pairs in a TensorDict of batch size (N,)", type(data).__name__))
     check_number("validation_fraction", options["validation_fraction"], above=0.0, below=1.0)

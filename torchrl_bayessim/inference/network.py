@@ -5,7 +5,7 @@ from __future__ import annotations
 __all__ = ["Covariance", "MixtureDensityNetwork", "melu"]
 
 from collections.abc import Iterable
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -88,6 +88,12 @@ class MixtureDensityNetwork(nn.Module):
         self.register_buffer("shift", torch.zeros(features.dim))
         self.register_buffer("scale", torch.ones(features.dim))
         self.register_buffer("widening", torch.ones(parameters))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        widening = state_dict.get(f"{prefix}widening")
+        if widening is not None and not widening.ndim:  # of before: one factor for all parameters
+            state_dict[f"{prefix}widening"] = widening.expand_as(self.widening)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def standardize_inputs(self, summaries: Tensor | Iterable[Tensor]) -> InputScaling:
         """Set the input scaling from training summaries ``(N, L)``, or from parts of them.

@@ -24,7 +24,6 @@ __all__ = [
     "AnalyticCorrection",
     "HighestDensityPrior",
     "analytic_correction",
-    "effective_sample_size",
     "focus",
     "gaussian_proposal",
     "importance_weights",
@@ -46,6 +45,8 @@ from .network import WIDEST
 from .physics_posterior import PhysicsPosterior
 from .priors import BoxPrior, Prior
 from .truncation import TruncatedGaussianMixture
+
+_RIM = 0.01  # of a box's width: a posterior that begins there is cut off by its edge
 
 
 class Proposal(Protocol):
@@ -88,16 +89,6 @@ def importance_weights(
     return (prior.log_prob(theta) - log_density).exp()
 
 
-def effective_sample_size(weights: Tensor) -> float:
-    r"""Return :math:`(\sum w)^2 / \sum w^2`: how many equal weights these are worth (Kish, 1965).
-
-    Example:
-        >>> effective_sample_size(torch.tensor([1.0, 1.0, 0.0]))
-        2.0
-    """
-    return (weights.sum().square() / weights.square().sum().clamp_min(1e-30)).item()
-
-
 def focus(
     prior: BoxPrior,
     posterior: PhysicsPosterior,
@@ -112,6 +103,8 @@ def focus(
     the smaller box resolves it better. It is the posterior under the full prior wherever the box
     holds all of that posterior; the margin allows for a first posterior that is too sure. Without
     the tails, as one wide component of negligible weight would keep the box as wide as the prior.
+    A posterior that ends at an edge of the box that it was learned over is cut off there: on that
+    side the margin is a share of that box.
 
     Args:
         prior: The full prior.
@@ -133,7 +126,16 @@ def focus(
     u = prior.standardize(draw(posterior, 4096, key=(seed, "focus")).double())
     low, high = torch.quantile(u, torch.tensor([tail, 1 - tail], dtype=u.dtype), 0)
     width = (high - low).clamp_min(1e-4)
-    edges = prior.unstandardize(torch.stack([low - margin * width, high + margin * width]))
+    below, above = width, width
+    if isinstance(posterior.prior, BoxPrior):
+        least, most = prior.standardize(
+            torch.stack([posterior.prior.low, posterior.prior.high]).double()
+        )
+        before = most - least
+        # what ends at the edge of the box before may lie beyond: as far as that box is wide
+        below = torch.where(low - least < _RIM * before, before, below)
+        above = torch.where(most - high < _RIM * before, before, above)
+    edges = prior.unstandardize(torch.stack([low - margin * below, high + margin * above]))
     return prior.within(*edges.to(prior.low.dtype))
 
 

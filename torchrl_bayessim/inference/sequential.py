@@ -32,11 +32,11 @@ from .proposals import (
     HighestDensityPrior,
     Proposal,
     analytic_correction,
-    effective_sample_size,
     focus,
     gaussian_proposal,
     importance_weights,
 )
+from .weights import effective_sample_size
 
 Correction = Literal["focused", "importance", "truncated", "analytic"]
 CORRECTIONS = get_args(Correction)
@@ -195,7 +195,8 @@ def _inside(history: list[tuple[Any, TensorDict]], box: BoxPrior) -> TensorDictB
     kept = []
     for drawn_from, pairs in history:
         if (drawn_from.low <= box.low).all() and (drawn_from.high >= box.high).all():
-            kept.append(pairs[box.contains(pairs["theta"])])
+            theta = pairs["theta"]  # without the rounding that `contains` allows
+            kept.append(pairs[((theta >= box.low) & (theta <= box.high)).all(-1)])
     found: Any = torch.cat(kept)
     return found.set("weight", torch.ones(len(found)))
 

@@ -6,7 +6,7 @@ called. Several networks in one graph call them once.
 
 from __future__ import annotations
 
-__all__ = ["StackedNetworks", "alike"]
+__all__ = ["OneNetwork", "StackedNetworks", "alike", "as_one"]
 
 import copy
 from collections.abc import Sequence
@@ -20,18 +20,58 @@ from .features import NeuralFeatures, ResidualFeatures
 from .mixtures import Mixture
 from .network import MixtureDensityNetwork
 
-_OF_LINEAR_LAYERS = ResidualFeatures, NeuralFeatures  # and of nothing else with parameters
+_OF_LINEAR_LAYERS = ResidualFeatures, NeuralFeatures
+
+
+def as_one(networks: Sequence[MixtureDensityNetwork]) -> OneNetwork | StackedNetworks:
+    """Return what is trained in the place of networks that are :func:`alike`, or of one."""
+    return OneNetwork(networks[0]) if len(networks) == 1 else StackedNetworks(networks)
+
+
+class OneNetwork:
+    """One network, of any features, behind what :class:`StackedNetworks` has.
+
+    Args:
+        network: Trained in place.
+    """
+
+    def __init__(self, network: MixtureDensityNetwork) -> None:
+        self._network = network
+        self.parameters = list(network.parameters())
+        self._kept = copy.deepcopy(network.state_dict())
+
+    def mixture(self, scaled: Tensor) -> Mixture:
+        """Return the mixtures for standardised inputs, of shape ``(1, B, L)``."""
+        return Mixture(*(part.unsqueeze(0) for part in self._network.mixture(scaled[0])))
+
+    def clip_gradients(self, largest: float) -> None:
+        """Scale the gradient down to a norm of at most ``largest``."""
+        nn.utils.clip_grad_norm_(self.parameters, largest)
+
+    def zero_gradients(self) -> None:
+        """Forget the gradients."""
+        for parameter in self.parameters:
+            parameter.grad = None
+
+    def keep(self, which: Tensor) -> None:
+        """Remember the present state, if ``which``, of shape ``(1,)``, says so."""
+        if which:
+            self._kept = copy.deepcopy(self._network.state_dict())
+
+    def restore(self) -> None:
+        """Go back to the state that was kept last."""
+        self._network.load_state_dict(self._kept)
 
 
 class StackedNetworks:
-    """M networks that are :func:`alike`, or a single one of any kind.
+    """M networks that are :func:`alike`.
 
     Args:
-        networks: Stay as they are until :meth:`write`.
+        networks: Stay as they are until :meth:`restore`.
 
     Attributes:
-        parameters: All parameters that are not frozen, in a row, and their gradient, which adds up
-            until it is set to zero.
+        parameters: One tensor, of all parameters that are not frozen, and their gradient, which
+            adds up.
 
     Example:
         >>> one, other = (
@@ -46,60 +86,58 @@ class StackedNetworks:
     """
 
     def __init__(self, networks: Sequence[MixtureDensityNetwork]) -> None:
-        self._networks, self._size = networks, len(networks)
+        self._networks = networks
         self._module = copy.deepcopy(networks[0])
-        if self._size > 1:
-            for name, layer in list(self._module.named_modules()):
-                if isinstance(layer, nn.Linear):
-                    layers = [cast("nn.Linear", n.get_submodule(name)) for n in networks]
-                    self._module.set_submodule(name, _StackedLinear(layers))
+        for name, layer in list(self._module.named_modules()):
+            if isinstance(layer, nn.Linear):
+                layers = [cast("nn.Linear", n.get_submodule(name)) for n in networks]
+                self._module.set_submodule(name, _StackedLinear(layers))
         # one tensor for whoever makes steps, and views of it for the layers
         self._layers = _learned(self._module)
-        self.parameters = nn.Parameter(parameters_to_vector(self._layers).detach())
-        self.parameters.grad = torch.zeros_like(self.parameters)
-        vector_to_parameters(self.parameters.data, self._layers)
-        for layer, part in zip(self._layers, self._parts(self.parameters.grad), strict=True):
+        whole = nn.Parameter(parameters_to_vector(self._layers).detach())
+        self.parameters, self._gradient = [whole], torch.zeros_like(whole)
+        whole.grad, self._kept = self._gradient, whole.detach().clone()
+        vector_to_parameters(whole.data, self._layers)
+        for layer, part in zip(self._layers, self._parts(self._gradient), strict=True):
             layer.grad = part.view(layer.shape)
 
     def _parts(self, values: Tensor) -> list[Tensor]:
         """Return views of all parameters, or of as many values, by layer, ``(M, P_i)`` each."""
         sizes = [layer.numel() for layer in self._layers]
-        return [part.view(self._size, -1) for part in values.split(sizes)]
+        return [part.view(len(self._networks), -1) for part in values.split(sizes)]
 
     def mixture(self, scaled: Tensor) -> Mixture:
         """Return the mixtures for standardised inputs, those of each network, ``(M, B, L)``."""
-        if self._size == 1:
-            return Mixture(*(part.unsqueeze(0) for part in self._module.mixture(scaled[0])))
         return self._module.mixture(scaled)
 
     def clip_gradients(self, largest: float) -> None:
         """Scale the gradient of each network down to a norm of at most ``largest``."""
-        gradient = cast("Tensor", self.parameters.grad)
-        if gradient.norm() <= largest:  # of all, so none is larger
+        if self._gradient.norm() <= largest:  # of all, so none is larger
             return
-        parts = self._parts(gradient)
+        parts = self._parts(self._gradient)
         norm = torch.stack([part.square().sum(1) for part in parts]).sum(0).sqrt()
         share = (largest / norm).clamp(max=1.0).unsqueeze(1)
         for part in parts:
             part.mul_(share)
 
-    @torch.no_grad()
-    def copy_into(self, kept: Tensor, which: Tensor) -> None:
-        """Copy the parameters of some networks, ``(M,)`` booleans, into others like them."""
-        for mine, other in zip(self._parts(self.parameters), self._parts(kept), strict=True):
-            other[which] = mine[which]
+    def zero_gradients(self) -> None:
+        """Set the gradients to zero, in place: those of the layers are views."""
+        self._gradient.zero_()
 
     @torch.no_grad()
-    def write(self, values: Tensor) -> None:
-        """Give the networks these values of all parameters."""
+    def keep(self, which: Tensor) -> None:
+        """Remember the present parameters of some networks, ``(M,)`` booleans."""
+        here = which.to(self._kept.device)
+        parts = self._parts(self.parameters[0]), self._parts(self._kept)
+        for now, kept in zip(*parts, strict=True):
+            kept[here] = now[here]
+
+    @torch.no_grad()
+    def restore(self) -> None:
+        """Give each network the parameters that were kept last."""
         for row, network in enumerate(self._networks):
-            for layer, part in zip(_learned(network), self._parts(values), strict=True):
+            for layer, part in zip(_learned(network), self._parts(self._kept), strict=True):
                 layer.copy_(part[row].view_as(layer))
-        if self._size == 1:  # features of one's own may have learned some, as batch norms do
-            for own, learned in zip(
-                self._networks[0].buffers(), self._module.buffers(), strict=True
-            ):
-                own.copy_(learned)
 
 
 def _learned(module: nn.Module) -> list[nn.Parameter]:
@@ -119,14 +157,37 @@ class _StackedLinear(nn.Module):
 
 
 def alike(networks: Sequence[MixtureDensityNetwork]) -> bool:
-    """Return whether networks differ in their parameters only, and can be stacked."""
-    first = networks[0]
+    """Return whether networks differ in the weights of their linear layers only."""
     if any(type(network.features) not in _OF_LINEAR_LAYERS for network in networks):
         return False
-    return all(_settings(network) == _settings(first) for network in networks)
+    if any(not _of_linear_layers(network) for network in networks):
+        return False
+    parameters = {id(p) for network in networks for p in network.parameters()}
+    if len(parameters) < sum(len(list(network.parameters())) for network in networks):
+        return False  # some are shared
+    first = _settings(networks[0])
+    return all(_settings(network) == first for network in networks)
+
+
+def _of_linear_layers(network: MixtureDensityNetwork) -> bool:
+    """Return whether nothing but linear layers has parameters, buffers or hooks."""
+    for module in network.modules():
+        plain = type(module) is nn.Linear or module is network
+        if not plain and next(module.parameters(recurse=False), None) is not None:
+            return False
+        if module is not network and next(module.buffers(recurse=False), None) is not None:
+            return False
+        if module._forward_hooks or module._forward_pre_hooks or module._backward_hooks:
+            return False
+    return True
 
 
 def _settings(network: MixtureDensityNetwork) -> tuple[object, ...]:
-    shapes = [(name, tuple(p.shape), p.requires_grad) for name, p in network.named_parameters()]
+    layers = [(name, type(module)) for name, module in network.named_modules()]
+    parameters = [
+        (name, p.shape, p.dtype, p.device, p.requires_grad)
+        for name, p in network.named_parameters()
+    ]
     inputs = network.shift.tolist(), network.scale.tolist(), network.compress
-    return type(network), network.covariance, network.components, network.reach, inputs, shapes
+    mixtures = network.covariance, network.components, network.reach
+    return type(network), mixtures, inputs, layers, parameters

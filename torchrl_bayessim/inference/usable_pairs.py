@@ -35,7 +35,7 @@ def usable_pairs(
     return data[rows], len(data) - len(rows)
 
 
-def usable_rows(data: TensorDictBase, *keys: NestedKey) -> Tensor:
+def usable_rows(data: TensorDictBase, *keys: NestedKey, stacklevel: int = 3) -> Tensor:
     """Return the rows in which all entries of these keys are finite; warn of the others."""
     for key in keys:
         if data.get(key, None) is None:
@@ -66,7 +66,7 @@ def usable_rows(data: TensorDictBase, *keys: NestedKey) -> Tensor:
             )
         )
     text = f"{int((~good).sum())} of {len(good)} pairs are not finite: left out ({where})"
-    warnings.warn(text, stacklevel=3)
+    warnings.warn(text, stacklevel=stacklevel)
     return good.nonzero().flatten()
 
 
@@ -101,7 +101,7 @@ def warn_of(scaling: InputScaling, pairs: Rows, key: NestedKey) -> None:
             "nothing about the parameters, and the posterior is what they were drawn from, the "
             "prior if it was. Do the parameters reach the simulator, and the statistics see it?"
         )
-        warnings.warn(text, stacklevel=3)
+        warnings.warn(text, stacklevel=4)
     for column in scaling.absurd.nonzero().flatten().tolist()[:3]:
         values = torch.cat([part.get(key)[:, column] for part in pairs.parts()])
         row = int((values - scaling.shift[column]).abs().argmax())
@@ -110,7 +110,7 @@ def warn_of(scaling: InputScaling, pairs: Rows, key: NestedKey) -> None:
             f"those of the others that they could not be told apart beside it (median "
             f"{scaling.shift[column]:.3g}): scaled by the quartiles. Did this simulation diverge?"
         )
-        warnings.warn(text, stacklevel=3)
+        warnings.warn(text, stacklevel=4)
 
 
 def rows_that_count(posterior: MixtureDensityPosterior, pairs: Rows) -> Tensor:

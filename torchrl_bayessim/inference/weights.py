@@ -1,8 +1,8 @@
-"""The weights of pairs, and means by them."""
+"""The weights of pairs, and what they are worth."""
 
 from __future__ import annotations
 
-__all__ = ["weighted_mean", "weights_of"]
+__all__ = ["effective_sample_size", "weights_of"]
 
 import torch
 from tensordict import TensorDictBase
@@ -23,12 +23,11 @@ def weights_of(pairs: TensorDictBase) -> Tensor:
     return weight.reshape(len(pairs)).double()
 
 
-def weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
-    """Return the mean by weights ``(N,)``; where a weight is 0 the value may be anything.
+def effective_sample_size(weights: Tensor) -> float:
+    r"""Return :math:`(\sum w)^2 / \sum w^2`: how many equal weights these are worth (Kish, 1965).
 
     Example:
-        >>> weighted_mean(torch.tensor([1.0, torch.nan]), torch.tensor([2.0, 0.0]))
-        tensor(1.)
+        >>> effective_sample_size(torch.tensor([1.0, 1.0, 0.0]))
+        2.0
     """
-    total = torch.where(weight > 0, weight * values, 0.0).sum()
-    return total / weight.sum().clamp_min(torch.finfo(weight.dtype).tiny)
+    return (weights.sum().square() / weights.square().sum().clamp_min(1e-30)).item()

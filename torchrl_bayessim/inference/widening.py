@@ -8,10 +8,12 @@ average of networks that disagree is wider than each of them already: it may nee
 The factors :math:`f_d` maximise
 
 .. math::
-    \sum_i \log q_f(\theta_i \mid x_i) - \sum_d \log(1 + (\log f_d / s)^2)
+    \sum_i \log q_f(\theta_i \mid x_i) - \sum_d \log(1 + (\log (f_d / f_0) / s)^2)
 
-over the held-out pairs: they stay near 1 unless the pairs say otherwise, and follow them freely
-where they do, as those of a parameter that nothing is known about must.
+over the held-out pairs (by their weights, which sum to the effective number of pairs): they stay
+near :math:`f_0`, which is 1 for averages and 1.1 for a network alone, unless the pairs say
+otherwise, and follow them freely where they do, as those of a parameter that nothing is known about
+must.
 """
 
 from __future__ import annotations
@@ -28,12 +30,15 @@ from scipy.optimize import minimize
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from .mixtures import component_log_prob
 from .posterior import TRAINING_POINTS, MixtureDensityPosterior
 from .truncation import TruncatedGaussianMixture
-from .weights import weights_of
+from .weights import effective_sample_size, weights_of
 
 _NARROWEST, _WIDEST = 0.5, 10.0
 _NEAR = 0.15  # s: what a hundred pairs leave unsure
+_TOO_SURE = 1.1  # what a network alone needs, where the pairs are too few to say
+_MOST = 2000  # held-out pairs that are used
 
 
 def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase) -> Tensor:
@@ -44,19 +49,26 @@ def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase)
             alone is never made surer.
         held_out: Pairs ``{"theta", "summary"[, "weight"]}`` that no network learned from.
     """
-    first = networks[0]
+    first, counting = networks[0], (weights_of(held_out) > 0).nonzero().flatten()
+    held_out = held_out[counting[:: math.ceil(len(counting) / _MOST)]]
     z = first.prior.standardize(held_out.get(first.theta_key).double())
     weight = weights_of(held_out).to(z)
+    weight, pairs = weight / weight.sum(), effective_sample_size(weight)
+    usual = math.log(_TOO_SURE) if len(networks) == 1 else 0.0
     with torch.no_grad():
         summary = held_out.get(first.summary_key)
         raw = [n.network.raw(n.network.scaled(summary)) for n in networks]
 
     def loss(values: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        log_factors = torch.as_tensor(values).to(z).requires_grad_()
-        q = average([_mixture(n, r, log_factors.exp()) for n, r in zip(networks, raw, strict=True)])
-        penalty = (log_factors / _NEAR).square().log1p().sum() / weight.sum()
-        total = penalty - (q.log_prob(z) * weight).sum() / weight.sum()
-        (gradient,) = torch.autograd.grad(total, log_factors)
+        with torch.enable_grad():
+            log_factors = torch.as_tensor(values).to(z).requires_grad_()
+            factors = log_factors.exp()
+            q = average([_mixture(n, r, factors) for n, r in zip(networks, raw, strict=True)])
+            # without the bounds, where a pair on the rim may be out by rounding
+            each = component_log_prob(z, q.loc, q.scale_tril) - q.log_mass
+            penalty = ((log_factors - usual) / _NEAR).square().log1p().sum() / pairs
+            total = penalty - ((q.logits + each).logsumexp(-1) * weight).sum()
+            (gradient,) = torch.autograd.grad(total, log_factors)
         return total.item(), gradient.double().cpu().numpy()
 
     least = 1.0 if len(networks) == 1 else _NARROWEST
