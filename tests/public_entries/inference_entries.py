@@ -124,7 +124,7 @@ ENTRIES = {
             "rounds": "count",
             "simulations": "count",
             "networks": "count",
-            "correction": "name",
+            "correction": "name or none",
             "prior_share": "share",
             "make_posterior": "function or none",
         },
