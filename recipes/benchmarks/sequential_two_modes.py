@@ -28,13 +28,12 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchrl_bayessim.inference.priors import BoxPrior
-from torchrl_bayessim.inference.sequential import Correction, sequential
+from torchrl_bayessim.inference.sequential import CORRECTIONS, Correction, sequential
 from torchrl_bayessim.randomness import generator, isolated
 
 NOISE, OBSERVED, ROUNDS = 0.2, 1.0, 3
 # patience as long as the fit, so that the cosine of the learning rate reaches its end
 FIT = {"epochs": 50, "patience": 50, "batch_size": 500, "lr": 5e-3}
-CORRECTIONS: tuple[Correction, ...] = ("focused", "importance", "truncated", "analytic")
 
 LogDensity = Callable[[Tensor], Tensor]
 

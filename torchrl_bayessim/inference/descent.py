@@ -21,11 +21,9 @@ from tqdm.auto import tqdm
 
 from ..errors import SimulationError, message
 from ..randomness import generator
-from .mixtures import component_log_prob
-from .posterior import TRAINING_POINTS, MixtureDensityPosterior
+from .posterior import MixtureDensityPosterior, in_training
 from .rows import Rows
 from .stacked import OneNetwork, StackedNetworks, as_one
-from .truncation import log_mass
 from .weights import weights_of
 
 _WARM_UP = 0.1  # share of the steps in which the learning rate rises
@@ -166,14 +164,8 @@ def _loss(
     truncated: bool,
 ) -> Tensor:
     """Return each network's weighted negative log-density in nats, as `PosteriorLoss` does."""
-    logits, loc, scale_tril = (part.double() for part in networks.mixture(pairs.scaled))
-    each = component_log_prob(pairs.z, loc, scale_tril)
-    box = posterior.prior.box
-    if truncated and box is not None:
-        diagonal = posterior.network.covariance == "diagonal" or loc.shape[-1] == 1
-        box = box[0].to(loc), box[1].to(loc)
-        each = each - log_mass(loc, scale_tril, box, diagonal=diagonal, points=TRAINING_POINTS)
-    log_q = (logits.log_softmax(-1) + each).logsumexp(-1)
+    mixture = in_training(posterior, networks.mixture(pairs.scaled), truncated=truncated)
+    log_q = mixture.formula(pairs.z)
     return ((pairs.volume - log_q) * pairs.weight).sum(-1) / pairs.weight.sum(-1)
 
 

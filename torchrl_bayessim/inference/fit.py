@@ -20,6 +20,7 @@ from ..randomness import generator
 from ..scalars import check_number
 from .descent import descend
 from .features import FourierFeatures
+from .input_scaling import input_scaling
 from .posterior import MixtureDensityPosterior
 from .rows import Rows, mapped
 from .stacked import alike
@@ -110,10 +111,21 @@ def fit(
         TypeError: The posterior is none, the pairs are not a TensorDict, a count is no whole
             number, or a rate or share no number.
     """
-    options = {"epochs": epochs, "batch_size": batch_size, "patience": patience, "lr": lr}
-    options |= {"weight_decay": weight_decay, "validation_fraction": validation_fraction}
-    options |= {"rescale": rescale, "split_seed": split_seed, "progress": progress}
-    return fit_several([posterior], data, seeds=[seed], **options)[0]
+    (report,) = fit_several(
+        [posterior],
+        data,
+        seeds=[seed],
+        epochs=epochs,
+        batch_size=batch_size,
+        lr=lr,
+        weight_decay=weight_decay,
+        validation_fraction=validation_fraction,
+        patience=patience,
+        rescale=rescale,
+        split_seed=split_seed,
+        progress=progress,
+    )
+    return report
 
 
 def fit_several(
@@ -151,17 +163,19 @@ def fit_several(
     data = in_floats(data, *keys).select(*keys, "weight", strict=False)
     rows = usable_rows(data, *keys, stacklevel=4)
     dropped = len(data) - len(rows)
-    rows, *_ = [rows_that_count(posterior, Rows(data, rows)) for posterior in posteriors]
+    # once for those that ask for the same; which rows count is the same for all
+    unlike = {(str(p.prior.settings), len(p.network.shift)): p for p in posteriors}
+    rows = [rows_that_count(posterior, Rows(data, rows)) for posterior in unlike.values()][-1]
     order = rows[torch.randperm(len(rows), generator=generator(split_seed, "split"))]
     share = options["validation_fraction"]
     held_out = min(max(1, round(share * len(rows))), len(rows) - 2, _HELD_OUT)
     validation, train = data[order[:held_out]], Rows(data, order[held_out:])
+    if options["rescale"]:
+        scaling = input_scaling(part.get(keys[1]) for part in train.parts())
+        warn_of(scaling, Rows(data, rows), keys[1])
+        for posterior in posteriors:
+            posterior.network.set_inputs(scaling)
     for posterior in posteriors:
-        if options["rescale"]:
-            summaries = (part.get(keys[1]) for part in train.parts())
-            scaling = posterior.network.standardize_inputs(summaries)
-            if posterior is first:
-                warn_of(scaling, Rows(data, rows), keys[1])
         posterior.seen = train[:_SEEN].get(keys[1])
         posterior.held_out = validation
     names = "epochs", "batch_size", "lr", "weight_decay", "patience", "progress"

@@ -101,9 +101,13 @@ class MixtureDensityNetwork(nn.Module):
         Constant ones are ignored; see :mod:`.input_scaling` for those of absurd rows.
         """
         found = input_scaling([summaries] if isinstance(summaries, Tensor) else summaries)
-        self.shift.copy_(found.shift)
-        self.scale.copy_(found.scale)
+        self.set_inputs(found)
         return found
+
+    def set_inputs(self, scaling: InputScaling) -> None:
+        """Set the input scaling to one that was found."""
+        self.shift.copy_(scaling.shift)
+        self.scale.copy_(scaling.scale)
 
     def scaled(self, summary: Tensor) -> Tensor:
         """Return the standardised inputs of the features."""

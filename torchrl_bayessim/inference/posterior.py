@@ -13,7 +13,7 @@ simulators", arXiv:1906.01728, eq. 9-13). Nothing leaks outside the box and noth
 
 from __future__ import annotations
 
-__all__ = ["MixtureDensityPosterior"]
+__all__ = ["MixtureDensityPosterior", "in_training"]
 
 import warnings
 from functools import partial
@@ -269,6 +269,18 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
     def extra_repr(self) -> str:
         """Show the prior."""
         return repr(self.prior)
+
+
+def in_training(
+    posterior: MixtureDensityPosterior, mixture: Mixture, *, truncated: bool = True
+) -> TruncatedGaussianMixture:
+    """Return what a network's mixture stands for while it is fitted: its mass is coarse."""
+    return TruncatedGaussianMixture(
+        *mixture,
+        posterior.prior.box if truncated else None,
+        diagonal=posterior.network.covariance == "diagonal",
+        points=TRAINING_POINTS,
+    )
 
 
 def _distribution(

@@ -134,15 +134,13 @@ def sequential(
         history.append((proposal, pairs_of(theta, simulator(theta))))
         if correction == "analytic":  # more of one proposal after a refusal
             history = [entry for entry in history if entry[0] is proposal]
-        focused = correction == "focused"
-        pairs = (
-            _inside(history, proposal)
-            if focused
-            else _pairs(history, prior, weighted=correction != "analytic")
-        )
+        if correction == "focused":
+            local, pairs = proposal, _inside(history, proposal)
+        else:
+            local, pairs = prior, _pairs(history, prior, weighted=correction != "analytic")
         learned, report = learn(
             pairs,
-            proposal if focused else prior,
+            local,
             observed,
             make_posterior=MixtureDensityPosterior
             if make_posterior is None
@@ -176,15 +174,14 @@ def _divided(
 
 
 def _correction(given: Correction | None, prior: Prior, *, given_networks: bool) -> Correction:
-    if given is not None:
-        check_choice("a correction", given, CORRECTIONS)
-    if given != "focused":
-        usual = "focused" if isinstance(prior, BoxPrior) and not given_networks else "importance"
-        return given or usual
-    if not isinstance(prior, BoxPrior):
+    boxed = isinstance(prior, BoxPrior)
+    if given is None:
+        return "focused" if boxed and not given_networks else "importance"
+    check_choice("a correction", given, CORRECTIONS)
+    if given == "focused" and not boxed:
         expected = "a BoxPrior, of which focused rounds take smaller boxes"
         raise TypeError(message(expected, type(prior).__name__, hint="another correction"))
-    if given_networks:
+    if given == "focused" and given_networks:
         expected = "the default networks, which focused rounds make over smaller boxes"
         raise ValueError(message(expected, "make_posterior", hint="another correction"))
     return given

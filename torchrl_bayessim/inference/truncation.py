@@ -199,8 +199,15 @@ class TruncatedGaussianMixture(Distribution):
             slack = 1e-6 * (self.box[1] - self.box[0])
             inside &= ((value >= self.box[0] - slack) & (value <= self.box[1] + slack)).all(-1)
         safe = torch.where(inside.unsqueeze(-1), value, 0.0)
-        each = component_log_prob(safe, self.loc, self.scale_tril) - self.log_mass
-        return torch.where(inside, (self.logits + each).logsumexp(-1), -torch.inf)
+        return torch.where(inside, self.formula(safe), -torch.inf)
+
+    def formula(self, value: Tensor) -> Tensor:
+        """Return the log-density of values that are known to be inside, float64, shape ``(*)``.
+
+        A value on the rim, which rounding has put outside, has the density of the rim.
+        """
+        each = component_log_prob(value, self.loc, self.scale_tril) - self.log_mass
+        return (self.logits + each).logsumexp(-1)
 
     def sample(
         self, sample_shape: Sequence[int] = (), *, generator: torch.Generator | None = None

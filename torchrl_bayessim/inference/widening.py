@@ -30,8 +30,7 @@ from scipy.optimize import minimize
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from .mixtures import component_log_prob
-from .posterior import TRAINING_POINTS, MixtureDensityPosterior
+from .posterior import MixtureDensityPosterior, in_training
 from .truncation import TruncatedGaussianMixture
 from .weights import effective_sample_size, weights_of
 
@@ -49,12 +48,14 @@ def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase)
             alone is never made surer.
         held_out: Pairs ``{"theta", "summary"[, "weight"]}`` that no network learned from.
     """
-    first, counting = networks[0], (weights_of(held_out) > 0).nonzero().flatten()
-    held_out = held_out[counting[:: math.ceil(len(counting) / _MOST)]]
+    first, alone = networks[0], len(networks) == 1
+    weight = weights_of(held_out)
+    counting = (weight > 0).nonzero().flatten()
+    counting = counting[:: math.ceil(len(counting) / _MOST)]
+    held_out, weight = held_out[counting], weight[counting]
     z = first.prior.standardize(held_out.get(first.theta_key).double())
-    weight = weights_of(held_out).to(z)
-    weight, pairs = weight / weight.sum(), effective_sample_size(weight)
-    usual = math.log(_TOO_SURE) if len(networks) == 1 else 0.0
+    weight, pairs = (weight / weight.sum()).to(z), effective_sample_size(weight)
+    usual = math.log(_TOO_SURE if alone else 1.0)
     with torch.no_grad():
         summary = held_out.get(first.summary_key)
         raw = [n.network.raw(n.network.scaled(summary)) for n in networks]
@@ -63,17 +64,17 @@ def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase)
         with torch.enable_grad():
             log_factors = torch.as_tensor(values).to(z).requires_grad_()
             factors = log_factors.exp()
-            q = average([_mixture(n, r, factors) for n, r in zip(networks, raw, strict=True)])
-            # without the bounds, where a pair on the rim may be out by rounding
-            each = component_log_prob(z, q.loc, q.scale_tril) - q.log_mass
+            mixtures = [
+                n.network.widened(r, factors.to(r)) for n, r in zip(networks, raw, strict=True)
+            ]
+            members = [in_training(n, m) for n, m in zip(networks, mixtures, strict=True)]
             penalty = ((log_factors - usual) / _NEAR).square().log1p().sum() / pairs
-            total = penalty - ((q.logits + each).logsumexp(-1) * weight).sum()
+            total = penalty - (average(members).formula(z) * weight).sum()
             (gradient,) = torch.autograd.grad(total, log_factors)
         return total.item(), gradient.double().cpu().numpy()
 
-    least = 1.0 if len(networks) == 1 else _NARROWEST
     size = len(first.prior.names)
-    bounds = [(math.log(least), math.log(_WIDEST))] * size
+    bounds = [(math.log(1.0 if alone else _NARROWEST), math.log(_WIDEST))] * size
     options = {"maxiter": 15, "ftol": 1e-6}
     found = minimize(
         loss, np.zeros(size), jac=True, method="L-BFGS-B", bounds=bounds, options=options
@@ -82,18 +83,6 @@ def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase)
     for network in networks:
         network.network.widening.copy_(factors)
     return factors
-
-
-def _mixture(
-    posterior: MixtureDensityPosterior, raw: Tensor, factors: Tensor
-) -> TruncatedGaussianMixture:
-    network = posterior.network
-    return TruncatedGaussianMixture(
-        *network.widened(raw, factors.to(raw)),
-        posterior.prior.box,
-        diagonal=network.covariance == "diagonal",
-        points=TRAINING_POINTS,
-    )
 
 
 def average(members: Sequence[TruncatedGaussianMixture]) -> TruncatedGaussianMixture:
