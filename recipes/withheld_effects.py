@@ -190,8 +190,9 @@ def ask_baselines(out: Path, name: str, *, seed: int) -> None:
     if file.exists():
         return
     report = json.loads((out / "reports" / f"{name}.json").read_text())
-    budget = report.get("audit", {}).get("simulator_steps", 0)
-    said = methods.answers(out / "cases" / name, budget=budget, seed=seed)
+    audit = report.get("audit", {})
+    budget, noise = audit.get("simulator_steps", 0), audit.get("noise")
+    said = methods.answers(out / "cases" / name, budget=budget, seed=seed, noise=noise)
     write_text(file, json.dumps(scoring.finite(said)))
 
 

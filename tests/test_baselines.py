@@ -136,6 +136,25 @@ def test_every_baseline_answers_as_the_diagnosis_does_from_the_folder_alone(tmp_
     assert found["parameters only"]["effects"] == []
 
 
+def test_baselines_are_told_the_noise_and_try_every_form(tmp_path, plain):
+    from baselines.whole_runs import whole_runs
+
+    system = System.load(written(plain, tmp_path) / "system.yaml")
+    logs, channels = read_logs(tmp_path, system), system.robot.channels
+    told = whole_runs(system, logs, noise=dict.fromkeys(reversed(channels), 0.5))
+    assert told.noise.tolist() == [0.5] * len(channels)
+    assert not np.any(whole_runs(system, logs).noise == 0.5)
+    lags = {unit.effect for unit in told.units if unit.name == "action_lag"}
+    assert {effect.held for effect in lags} == {True, False}
+
+
+def test_two_that_explain_as_much_are_named_with_reserve():
+    from baselines.answers import graded
+
+    assert graded(30.0, 2.0, alike=2) == graded(30.0, 10.0, alike=2) == "ambiguous"
+    assert graded(30.0, 29.0, alike=2) == "unknown"
+
+
 def test_nothing_is_named_that_was_withheld(tmp_path, rubbing):
     from baselines.methods import answers
 

@@ -32,16 +32,25 @@ def share_explained(before: float, after: float) -> float:
     return min((before - after) / (before - 1.0), 1.0) if before > 1.0 else 0.0
 
 
-def graded(before: float, after: float) -> str:
+def graded(before: float, after: float, *, alike: int = 1) -> str:
     """Return the verdict on an effect, by the mean squares without and with it.
+
+    Args:
+        before: Without the effect.
+        after: With it.
+        alike: How many names explain as much.
 
     Example:
         >>> graded(1.01, 1.0), graded(30.0, 29.0), graded(30.0, 10.0), graded(30.0, 2.0)
         ('none', 'unknown', 'named_partial', 'named')
+        >>> graded(30.0, 2.0, alike=2)
+        'ambiguous'
     """
     if before - after < _NOTHING * max(before, 1.0):
         return "none" if before < FITS else "unknown"
     share = share_explained(before, after)
+    if share >= _PARTIAL and alike > 1:
+        return "ambiguous"
     return "named" if share >= _NAMED else "named_partial" if share >= _PARTIAL else "unknown"
 
 

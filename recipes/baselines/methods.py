@@ -35,13 +35,16 @@ METHODS: Mapping[str, Method] = {
 """Functions of the runs, the diagnosis' simulated time steps and a seed."""
 
 
-def answers(case: Path, *, budget: int, seed: int) -> dict[str, dict[str, Any]]:
+def answers(
+    case: Path, *, budget: int, seed: int, noise: Mapping[str, float] | None = None
+) -> dict[str, dict[str, Any]]:
     """Return every baseline's answer to a case; whatever goes wrong is its answer.
 
     Args:
         case: The folder that the diagnosis was given.
         budget: Time steps that the diagnosis simulated.
         seed: Of draws.
+        noise: What the diagnosis estimated, so that no baseline fails for want of it.
     """
     found: dict[str, dict[str, Any]] = {}
     with threadpool_limits(1, user_api="blas"):
@@ -49,7 +52,7 @@ def answers(case: Path, *, budget: int, seed: int) -> dict[str, dict[str, Any]]:
             begun = time.perf_counter()
             try:
                 system = System.load(case / "system.yaml")
-                runs = whole_runs(system, read_logs(case, system))
+                runs = whole_runs(system, read_logs(case, system), noise=noise)
                 found[name] = method(runs, budget, seed)
             except Exception as error:
                 found[name] = {"verdict": "crash", "summary": f"{type(error).__name__}: {error}"}

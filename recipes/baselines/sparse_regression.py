@@ -21,7 +21,7 @@ from torchrl_bayessim.diagnosis.refit import refit
 
 from .answers import answer, graded, share_explained
 from .forces import Forces, columns, forces
-from .strength_grid import scan
+from .strength_grid import LEVELS, best_strengths, on_grid
 from .whole_runs import Array, Runs, mean_square
 
 _THRESHOLDS = (0.05, 0.1, 0.2, 0.4, 0.8)  # standard deviations of the residual's noise
@@ -120,7 +120,10 @@ def _simulated(runs: Runs, nominal: Point, places: Sequence[tuple[str, int]]) ->
     strengths: dict[Unit, float] = {}
     for name, dof in places[:_MOST]:
         units = [u for u in runs.units if u.name == name and _at(runs, u, dof)]
-        strengths |= scan(runs.sets["train"], nominal.z, tuple(units[:1]))
+        best = best_strengths(runs.sets["train"], nominal.z, on_grid(units, LEVELS))
+        if best:
+            unit = min(best, key=lambda unit: best[unit][0])
+            strengths[unit] = best[unit][1]
     if not strengths:
         return nominal
     point = refit(runs.sets["train"], [Point(nominal.z, strengths)])[0].point

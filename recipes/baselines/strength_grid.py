@@ -5,7 +5,7 @@ No parameter is refitted: what a wrong mass does is then put down to whatever re
 
 from __future__ import annotations
 
-__all__ = ["best_of_grid", "best_strengths", "on_grid", "scan", "strength_grid"]
+__all__ = ["LEVELS", "best_of_grid", "best_strengths", "on_grid", "scan", "strength_grid"]
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -17,7 +17,8 @@ from torchrl_bayessim.diagnosis.objective import Objective, Point, Unit
 from .answers import answer, graded, share_explained
 from .whole_runs import Array, Runs, mean_square
 
-_LEVELS = (0.01, 0.03, 0.1, 0.2, 0.4, 0.7, 1.0)  # of an effect's range
+LEVELS = (0.01, 0.03, 0.1, 0.2, 0.4, 0.7, 1.0)
+"""Shares of an effect's range."""
 _AS_GOOD = 1.05  # times the error of the best
 
 
@@ -31,7 +32,7 @@ def strength_grid(runs: Runs) -> dict[str, Any]:
 
 def scan(objective: Objective, z: Array, units: tuple[Unit, ...]) -> dict[Unit, float]:
     """Return the strength of each unit, on the grid, that leaves least error."""
-    best = best_strengths(objective, z, on_grid(units, _LEVELS))
+    best = best_strengths(objective, z, on_grid(units, LEVELS))
     return {unit: strength for unit, (_, strength) in best.items()}
 
 
@@ -65,11 +66,12 @@ def best_of_grid(runs: Runs, nominal: Point, points: Mapping[Unit, Point]) -> di
     first = next(iter(errors))
     before, after = (mean_square(some) for some in test([nominal, points[first]]))
     near = [unit.name for unit, error in errors.items() if error <= _AS_GOOD * errors[first]]
+    names = list(dict.fromkeys(near))
     return answer(
         runs,
-        graded(bare, errors[first]),
+        graded(bare, errors[first], alike=len(names)),
         found={first: points[first].strengths[first]},
-        confused=list(dict.fromkeys(near)),
+        confused=names,
         theta=(runs.sets["train"].theta(nominal.z), runs.sets["train"].theta(points[first].z)),
         explained=share_explained(before, after),
     )

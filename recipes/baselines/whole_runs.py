@@ -33,9 +33,9 @@ class Runs:
     Attributes:
         system: The nominal system.
         logs: Of each split, ``train``, ``validation`` and ``test``: those of the diagnosis.
-        noise: Standard deviation of each channel's noise, told or from differences.
+        noise: Standard deviation of each channel's noise.
         sets: Objectives of each split; their innovations are residuals over ``noise``.
-        units: The effects that may be named, random ones left out.
+        units: The effects that may be named in all their forms, random ones left out.
     """
 
     system: System
@@ -50,25 +50,35 @@ class Runs:
         return self.sets["train"].predictor
 
 
-def whole_runs(system: System, logs: Sequence[Log]) -> Runs:
-    """Return the runs of a case, ready to be simulated under any parameters and effects."""
+def whole_runs(
+    system: System, logs: Sequence[Log], *, noise: Mapping[str, float] | None = None
+) -> Runs:
+    """Return the runs of a case, ready to be simulated under any parameters and effects.
+
+    Args:
+        system: The nominal system.
+        logs: Of the robot.
+        noise: Standard deviation of each channel's noise, as the diagnosis estimated it; default
+            what is told, or what differences say.
+    """
     predictor = Predictor(system, threads=1)
-    parts, noise = split(logs), assumed_noise(predictor, logs)
+    parts, sd = split(logs), assumed_noise(predictor, logs)
+    if noise is not None:
+        sd = np.array([noise[channel] for channel in system.robot.channels])
     steps = min(len(log) for log in logs) - 1
     history = round(_HISTORY / system.control_dt)
     runs = {n: cut(part, steps, history=history, checks=_CHECKS) for n, part in parts.items()}
     names = list(CATALOGUE) if system.effects is None else system.effects
     seconds = max(len(log) for log in logs) * system.control_dt
-    every = units_of([effect(name).forms(seconds)[0] for name in names], system.robot)
+    forms = [form for name in names for form in effect(name).forms(seconds)]
+    every = units_of(forms, system.robot)
     units = tuple(unit for unit in every if not unit.effect.random)
-    predictor = with_fewest_steps(
-        predictor, runs["train"], units, z=origin(system.prior), noise=noise
-    )
+    predictor = with_fewest_steps(predictor, runs["train"], units, z=origin(system.prior), noise=sd)
     sets = {
-        name: Objective(predictor, system.prior, some, _divided_by(noise, some))
+        name: Objective(predictor, system.prior, some, _divided_by(sd, some))
         for name, some in runs.items()
     }
-    return Runs(system, parts, noise, sets, units)
+    return Runs(system, parts, sd, sets, units)
 
 
 def mean_square(innovations: Array) -> float:
