@@ -153,6 +153,37 @@ def test_what_cannot_be_fitted_together_is_refused(options, text):
         fit_several([*posteriors()[:2], other], pairs(), seeds=[1, 2, 3])
 
 
+def test_one_seed_for_several_is_refused():
+    with pytest.raises(TypeError, match="expected seeds, one for each posterior, got 'one seed'"):
+        fit_several(posteriors(), pairs(), seeds=[1, 2, 3], seed=0)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_an_interrupted_fit_leaves_each_network_at_its_best_epoch(count, monkeypatch):
+    data, steps = pairs(), []
+
+    class Interrupted(torch.optim.AdamW):
+        def step(self, closure=None):
+            steps.append(1)
+            if len(steps) == 12:  # in the third epoch, of five steps each
+                raise KeyboardInterrupt
+            return super().step(closure)
+
+    options = {"batch_size": 60, "epochs": 9, "progress": False}
+    seeds = list(range(count))
+    whole, broken = posteriors()[:count], posteriors()[:count]
+    monkeypatch.setattr(torch.optim, "AdamW", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fit_several(broken, data, seeds=seeds, **options)
+    monkeypatch.undo()
+    reports = fit_several(whole, data, seeds=seeds, **options)
+    for posterior, report in zip(broken, reports, strict=True):
+        held_out = posterior.held_out
+        assert held_out is not None
+        loss = PosteriorLoss(posterior)(held_out)["loss_posterior"].item()
+        assert loss == pytest.approx(min(report.validation[:2]), abs=1e-4)
+
+
 def test_a_short_fit_ends_with_the_loss_itself():
     nets, data = posteriors()[:2], pairs()
     options = {"batch_size": 32, "lr": 1e-2, "weight_decay": 0.0, "patience": 9, "progress": False}

@@ -54,6 +54,8 @@ def descend(
 ) -> list[tuple[list[float], list[float]]]:
     """Leave each posterior with the parameters of its best epoch; return its losses per epoch.
 
+    An interrupt or an error leaves them so, too.
+
     Args:
         posteriors: Changed in place. Several are :func:`.stacked.alike` and have one prior.
         train: Pairs to learn from, or rows of pairs on disk, which are read as they are needed.
@@ -83,28 +85,29 @@ def descend(
     truncated, stale = first.prior.box is None, 0
     trace: list[tuple[Tensor, Tensor]] = []
     bar = tqdm(range(epochs), desc="fit", disable=not progress, leave=False, unit="epoch")
-    for epoch in bar:
-        if not truncated and (epoch >= min(_FREE * epochs, epochs - 1) or stale >= patience):
-            truncated, stale = True, 0
-        total = torch.zeros(size)
-        order = torch.stack([torch.randperm(len(train), generator=g) for g in shuffles])
-        for rows in order.chunk(batches, 1):
-            loss = _loss(first, networks, pairs(rows), truncated=truncated)
-            _check_loss(loss)
-            loss.sum().backward()
-            step()
-            total += loss.detach().cpu() * (rows.shape[1] / len(train))
-        with torch.no_grad():
-            held_out = _loss(first, networks, held, truncated=True).cpu()
-        trace.append((total, held_out))
-        bar.set_postfix(train=f"{total.mean():.2f}", held_out=f"{held_out.mean():.2f}")
-        better, stale = held_out < best - 1e-4, stale + 1
-        if better.any():
-            best, stale = torch.where(better, held_out, best), 0
-            networks.keep(better)
-        if truncated and stale >= patience:
-            break
-    networks.restore()
+    try:
+        for epoch in bar:
+            if not truncated and (epoch >= min(_FREE * epochs, epochs - 1) or stale >= patience):
+                truncated, stale = True, 0
+            order = torch.stack([torch.randperm(len(train), generator=g) for g in shuffles])
+            total = torch.zeros(size)
+            for rows in order.chunk(batches, 1):
+                loss = _loss(first, networks, pairs(rows), truncated=truncated)
+                total += _checked(loss).detach().cpu() * (rows.shape[1] / len(train))
+                loss.sum().backward()
+                step()
+            with torch.no_grad():
+                held_out = _loss(first, networks, held, truncated=True).cpu()
+            trace.append((total, held_out))
+            bar.set_postfix(train=f"{total.mean():.2f}", held_out=f"{held_out.mean():.2f}")
+            better, stale = held_out < best - 1e-4, stale + 1
+            if better.any():
+                best, stale = torch.where(better, held_out, best), 0
+                networks.keep(better)
+            if truncated and stale >= patience:
+                break
+    finally:  # interrupted, too, each is what it was at its best
+        networks.restore()
     learned, held_out = (torch.stack(part).T.tolist() for part in zip(*trace, strict=True))
     return list(zip(learned, held_out, strict=True))
 
@@ -169,7 +172,7 @@ def _loss(
     return ((pairs.volume - log_q) * pairs.weight).sum(-1) / pairs.weight.sum(-1)
 
 
-def _check_loss(loss: Tensor) -> None:
+def _checked(loss: Tensor) -> Tensor:
     if not loss.isfinite().all():
         raise SimulationError(
             message(
@@ -178,3 +181,4 @@ def _check_loss(loss: Tensor) -> None:
                 hint="a smaller learning rate, or fewer constant or redundant statistics",
             )
         )
+    return loss

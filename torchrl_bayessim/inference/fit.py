@@ -152,9 +152,11 @@ def fit_several(
     Raises:
         ValueError: As :func:`fit`, no posterior, other keys of some, or not one seed for each.
         SimulationError: As :func:`fit`.
-        TypeError: As :func:`fit`.
+        TypeError: As :func:`fit`, or one seed for all.
     """
     check_fit_options(options)
+    if "seed" in options:
+        raise TypeError(message("seeds, one for each posterior", "one seed"))
     options = _defaults() | options
     _check(posteriors, seeds, data, options)
     first = posteriors[0]
