@@ -86,6 +86,18 @@ def test_a_drive_that_follows_within_the_step_acts_by_its_mean():
     )
 
 
+def test_a_soft_saturation_takes_as_much_of_the_largest_command_and_little_of_small_ones():
+    most = float(ROBOT.command_scale[0])
+    small, large = changed("saturation", 0.4, 0.01 * most, -most, soft=True)
+    assert small == pytest.approx(0.01 * most, rel=1e-3)
+    assert large == pytest.approx(-0.6 * most)
+    assert changed("saturation", 0.0, most, soft=True) == [most]
+    assert effect("saturation").forms(9.0) == (
+        effect("saturation"),
+        effect("saturation", soft=True),
+    )
+
+
 def test_a_battery_loses_no_more_than_half_again_of_its_sag():
     values = changed("battery_sag", 0.4, *[1.0] * 40, seconds=1.0)
     assert values[10] == pytest.approx(0.6)
@@ -405,6 +417,18 @@ def test_a_body_without_an_end_of_its_own_carries_nothing_there():
         robot = robot_of(Task(model=mujoco.MjModel.from_xml_string(text), frame_skip=1))
         assert effect("payload").targets(robot) == ("link",)
         assert effect("payload", at_end=True).targets(robot) == ()
+
+
+def test_a_spring_that_hardens_pulls_as_it_says():
+    model = arm().model
+    models = written("parallel_spring", {"rail": 3.0}, hardening=0.5)
+    model.jnt_stiffness[2] = models.read("jnt_stiffness", (2,)).item()
+    model.jnt_stiffnesspoly[2] = [models.read("jnt_stiffnesspoly", (2, i)).item() for i in (0, 1)]
+    data = mujoco.MjData(model)
+    for x in (-0.4, 0.3):
+        data.qpos[model.jnt_qposadr[2]] = model.qpos_spring[model.jnt_qposadr[2]] + x
+        mujoco.mj_forward(model, data)
+        assert data.qfrc_spring[2] == pytest.approx(-3.0 * x * (1 + 0.5 * x**2))
 
 
 def test_entries():

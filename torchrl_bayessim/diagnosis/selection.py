@@ -18,10 +18,10 @@ import numpy as np
 
 from .alternatives import alternatives, exchanged
 from .explanations import bent, compare, explanations
+from .form_fit import with_fitted_forms
 from .further_effects import identified, nothing_left
 from .model import Model, as_good, criterion, gain, judged, needed
 from .objective import Objective, Point, Unit
-from .phase_fit import with_fitted_phases
 from .refit import Fit, refit
 from .screening import Screen
 from .shapes import with_shapes
@@ -99,7 +99,7 @@ def select(
         better = _needed_only(start, best, _chosen(best, models), models)
         if better is None or not identified(start, best, better, models):
             break
-        best = with_fitted_phases(train, validation, _exactly(train, validation, better))
+        best = with_fitted_forms(train, validation, _exactly(train, validation, better))
         new = [unit for unit in best.units if unit not in better.units]
         units = with_shapes(units, new)  # in the places of what was read off a grid
         tried += [best] if new else []

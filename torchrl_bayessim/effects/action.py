@@ -169,11 +169,23 @@ class DeadBand(ActionEffect):
 class Saturation(ActionEffect):
     """Strong commands are cut: ``clip(u, ±(1 − s) u_max)``, where ``u_max`` bounds commands.
 
-    A fraction, 0 to 0.9.
+    A fraction, 0 to 0.9: what the largest command loses. A soft one, such as an iron core's, bends
+    all along, ``u / √(1 + ((1 − s)⁻² − 1) (u / u_max)²)``, where the largest loses as much.
+
+    Args:
+        soft: Whether it is a soft one.
     """
 
     name, unit, group, memoryless = "saturation", "fraction", "gain", True
     limit = True
+
+    def __init__(self, *, soft: bool = False) -> None:
+        self.soft = soft
+
+    def forms(self, seconds: float) -> tuple[Effect, ...]:
+        """Return the hard and the soft one."""
+        del seconds
+        return Saturation(), Saturation(soft=True)
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.9."""
@@ -183,8 +195,12 @@ class Saturation(ActionEffect):
         self, action: Tensor, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Tensor, Memory]:
         """Return the command within its limit."""
-        limit = (1 - strength) * now.robot.command_scale.to(action)
-        return torch.where(strength > 0, action.clamp(-limit, limit), action), memory
+        most = now.robot.command_scale.to(action)
+        limit = (1 - strength) * most
+        cut = action.clamp(-limit, limit)
+        if self.soft:
+            cut = action / (1 + ((1 - strength) ** -2 - 1) * (action / most) ** 2).sqrt()
+        return torch.where(strength > 0, cut, action), memory
 
 
 class ActionGain(ActionEffect):

@@ -17,6 +17,8 @@ from .effect import Fields, ModelEffect
 from .laws import within
 from .robot import Robot
 
+_SQUARE = 1  # MuJoCo's column of the stiffness that grows with the square of the angle
+
 
 class _Joint(ModelEffect):
     field: ClassVar[str]
@@ -61,9 +63,24 @@ class ViscousFriction(_Joint):
 
 
 class ParallelSpring(_Joint):
-    """A spring ``−s (q − q_ref)``; N m/rad, up to ``F_max`` at the end of the joint's range."""
+    """A spring ``−s x (1 + h x²)``, ``x = q − q_ref``; N m/rad, up to ``F_max`` at the range's end.
+
+    Args:
+        hardening: ``h``, rad⁻² or m⁻²; a diagnosis fits it.
+    """
 
     name, unit, group, field = "parallel_spring", "N m/rad", "elasticity", "jnt_stiffness"
+
+    def __init__(self, hardening: float = 0.0) -> None:
+        self.hardening = hardening
+
+    def write(self, fields: Fields, strength: Tensor, robot: Robot) -> None:
+        """Add to the joints' stiffness, and to that in proportion to the square of the angle."""
+        super().write(fields, strength, robot)
+        if self.hardening:
+            for j, index in enumerate(self._indices(robot)):
+                entry = "jnt_stiffnesspoly", (index, _SQUARE)
+                fields[entry] = fields[entry] + self.hardening * strength[..., j]
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and ``F_max`` per range of positions."""

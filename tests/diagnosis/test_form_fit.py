@@ -1,4 +1,4 @@
-"""Frequency and phase of a periodic force are fitted once it is in the model."""
+"""What a law has beside its strength is fitted once the effect is in the model."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,10 @@ from rail_cart import cart, ride
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 
-SOME = ("cogging", "coulomb_friction", "periodic_disturbance", "sensor_drift", "viscous_friction")
+SOME = (
+    "cogging", "coulomb_friction", "parallel_spring", "periodic_disturbance", "sensor_drift",
+    "viscous_friction",
+)  # fmt: skip
 FREQUENCY, PHASE, RATE = 1.37, 0.6, 31.0
 
 
@@ -32,3 +35,14 @@ def test_magnets_along_a_rail_are_found_with_their_distance_and_phase_and_nothin
     assert found.number == pytest.approx(RATE, rel=2e-3)
     assert found.phase == pytest.approx(PHASE, abs=0.03)
     assert report.gap.with_effects < 1.3
+
+
+@pytest.mark.parametrize(("hardening", "within"), [(5.0, 0.1), (0.0, None)])
+def test_a_spring_is_found_with_how_it_hardens_and_nothing_beside_it(hardening, within):
+    report = diagnosed(lambda t, q: -2.0 * q * (1 + hardening * q**2), 3)
+    assert [effect.name for effect in report.effects] == ["parallel_spring"]
+    assert report.effects[0].strength == pytest.approx(2.0, rel=0.05)
+    (found,) = report.strengths
+    expected = 0.0 if within is None else pytest.approx(hardening, rel=within)
+    assert found.hardening == expected
+    assert report.gap.with_effects < 1.1

@@ -1,13 +1,13 @@
-"""Frequency and phase of a periodic force that is in the model, fitted beside everything else.
+"""What the law of an effect in the model has beside its strength, fitted with everything else.
 
-What is read off the missing force (`shapes`) stands on a grid, and the force is a mean over short
-segments, which is late. A phase that is a little off leaves a sine of its own, which the next round
-would take for another effect.
+Frequency and phase of a periodic force that are read off the missing force (`shapes`) stand on a
+grid, and the force is a mean over short segments, which is late. A phase that is a little off, or a
+spring that hardens, leaves a force of its own, which the next round would take for another effect.
 """
 
 from __future__ import annotations
 
-__all__ = ["with_fitted_phases"]
+__all__ = ["with_fitted_forms"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..effects.disturbance import Cogging, PeriodicDisturbance
+from ..effects.joints import ParallelSpring
 from ..effects.units import slides
 from .model import LIKELY, Model, judged
 from .objective import Objective, Point, Unit
@@ -25,6 +26,7 @@ Array = NDArray[np.float64]
 _STEPS = 4  # of Gauss and Newton
 _MOVED = 0.05  # rad by which a force is moved to see what that does, at its farthest row
 _FARTHEST = 0.5  # rad in one step: sines are not linear
+_HARDER = 0.05  # by which a spring's stiffness grows, to see what that does, at its farthest row
 
 
 @dataclass(frozen=True)
@@ -34,15 +36,16 @@ class _Shift:
     unit: Unit
     number: str
     width: float
+    least: float = -np.inf
 
 
-def with_fitted_phases(train: Objective, validation: Objective, model: Model) -> Model:
-    """Return the model with the frequencies and phases of its periodic forces fitted, too.
+def with_fitted_forms(train: Objective, validation: Objective, model: Model) -> Model:
+    """Return the model with its periodic forces' frequencies and phases, and its springs, fitted.
 
     A force ``s sin(a + φ)`` of angle ``a = 2πft`` or ``a = kq`` is linear in small changes of ``φ``
-    and of ``f`` or ``k``; these are solved for together with parameters and strengths. On a hinge
-    ``k`` counts whole periods per turn and stays as it is. The model itself comes back where
-    nothing is gained that chance would not often give.
+    and of ``f`` or ``k``, and that of a spring, ``−s q (1 + h q²)``, in ``h``; these are solved for
+    together with parameters and strengths. On a hinge ``k`` counts whole periods per turn and stays
+    as it is. The model itself comes back where nothing is gained that chance would not often give.
     """
     best = model
     for _ in range(_STEPS):
@@ -67,6 +70,11 @@ def _shifts(train: Objective, model: Model) -> list[_Shift]:
         if isinstance(unit.effect, PeriodicDisturbance):
             latest = float(np.abs(segments.time).max())
             shifts.append(_Shift(unit, "frequency", _MOVED / (2 * np.pi * max(latest, 1e-9))))
+        elif isinstance(unit.effect, ParallelSpring):
+            where = segments.qpos[..., list(robot.qpos_index)][..., np.array(unit.direction) != 0]
+            farthest = float(np.abs(where).max())
+            shifts.append(_Shift(unit, "hardening", _HARDER / max(farthest, 1e-9) ** 2, 0.0))
+            continue
         elif isinstance(unit.effect, Cogging):
             joint = unit.joint(robot)
             if slides(robot, joint):
@@ -101,6 +109,7 @@ def _with(point: Point, shifts: Sequence[_Shift], widths: Sequence[float]) -> Po
     """Return the point with effects whose numbers are moved."""
     forms = {shift.unit: dict(shift.unit.effect.form) for shift in shifts}
     for shift, width in zip(shifts, widths, strict=True):
-        forms[shift.unit][shift.number] += width
-    moved = {u: replace(u, effect=type(u.effect)(**form)) for u, form in forms.items()}
-    return Point(point.z, {moved.get(u, u): s for u, s in point.strengths.items()})
+        moved = forms[shift.unit][shift.number] + width
+        forms[shift.unit][shift.number] = max(moved, shift.least)
+    others = {u: replace(u, effect=type(u.effect)(**form)) for u, form in forms.items()}
+    return Point(point.z, {others.get(u, u): s for u, s in point.strengths.items()})
