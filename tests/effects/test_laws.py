@@ -88,14 +88,25 @@ def test_a_drive_that_follows_within_the_step_acts_by_its_mean():
 
 def test_a_soft_saturation_takes_as_much_of_the_largest_command_and_little_of_small_ones():
     most = float(ROBOT.command_scale[0])
-    small, large = changed("saturation", 0.4, 0.01 * most, -most, soft=True)
+    small, large = changed("saturation", 0.4, 0.01 * most, -most, softness=0.5)
     assert small == pytest.approx(0.01 * most, rel=1e-3)
     assert large == pytest.approx(-0.6 * most)
-    assert changed("saturation", 0.0, most, soft=True) == [most]
+    assert changed("saturation", 0.0, most, softness=0.5) == [most]
     assert effect("saturation").forms(9.0) == (
         effect("saturation"),
-        effect("saturation", soft=True),
+        effect("saturation", softness=0.5),
     )
+
+
+def test_laws_bend_as_their_options_say():
+    most = float(ROBOT.command_scale[0])
+    assert changed("dead_band", 0.1, 0.1, -5.0, softness=1.0) == pytest.approx(
+        [0.05, -4.9020], 1e-4
+    )
+    assert changed("action_gain", 0.2, 0.5 * most, bend=-0.5) == pytest.approx([0.575 * most])
+    sag = changed("battery_sag", 0.5, *[2.0] * 11, seconds=1.0, bend=-0.4)
+    assert sag[5] == pytest.approx(2 * (1 - 0.5 * 0.5 * 0.8))
+    assert sag[10] == pytest.approx(2 * (1 - 0.5 * 0.6))
 
 
 def test_a_battery_loses_no_more_than_half_again_of_its_sag():
@@ -320,13 +331,27 @@ def test_the_dead_band_of_a_servo_holds_its_damping_too_or_not(damped, far, near
 
 def test_only_servos_with_damping_have_a_dead_band_without_it():
     forms = effect("dead_band").forms(9.0)
-    assert forms == (effect("dead_band"), effect("dead_band", damped=False))
+    soft = effect("dead_band", softness=0.5)
+    assert forms == (effect("dead_band"), effect("dead_band", damped=False), soft)
     for robot, some in (
-        (servo('kp="20" kv="2"'), [("servo",), ("servo",)]),
-        (servo('kp="20"'), [("servo",), ()]),
-        (ROBOT, [("motor",), ()]),
+        (servo('kp="20" kv="2"'), [("servo",), ("servo",), ()]),
+        (servo('kp="20"'), [("servo",), (), ()]),
+        (ROBOT, [("motor",), (), ("motor",)]),
     ):
         assert [form.on(robot).targets(robot) for form in forms] == some
+
+
+def test_a_servo_of_another_gain_is_what_mujoco_makes_of_it():
+    robot, stiffer = servo('kp="20" kv="2"'), servo('kp="26" kv="2.6"')
+    (law,) = [form.on(robot) for form in effect("action_gain").forms(9.0)[1:]]
+    added = band(law, robot, target=0.6, qpos=0.5, qvel=1.5, strength=0.3)
+    model = stiffer.require_model()
+    data = mujoco.MjData(model)
+    data.ctrl[:], data.qpos[:], data.qvel[:] = 0.6, 0.5, 1.5
+    mujoco.mj_forward(model, data)
+    assert 20 * (0.6 + added - 0.5) - 2 * 1.5 == pytest.approx(data.actuator_force[0])
+    assert effect("action_gain", servo=True).targets(ROBOT) == ()
+    assert effect("action_gain", **law.form).on(robot) == law
 
 
 def servo(gains):
@@ -336,11 +361,11 @@ def servo(gains):
     return robot_of(Task(model=mujoco.MjModel.from_xml_string(xml), frame_skip=1))
 
 
-def band(law, robot, *, target, qpos, qvel):
-    """Return what a band of 0.05 adds to the command."""
+def band(law, robot, *, target, qpos, qvel, strength=0.05):
+    """Return what a band, or another law of servos, adds to the command."""
     values = {"qpos": qpos, "qvel": qvel, "ctrl": target, "time": 0.0}
     state = Readings(**{name: torch.tensor([value]).double() for name, value in values.items()})
-    added, _ = Forcing(robot)([(law, torch.tensor([0.05]).double())], [{}], state)
+    added, _ = Forcing(robot)([(law, torch.tensor([strength]).double())], [{}], state)
     return added["ctrl"].item()
 
 
@@ -417,6 +442,18 @@ def test_a_body_without_an_end_of_its_own_carries_nothing_there():
         robot = robot_of(Task(model=mujoco.MjModel.from_xml_string(text), frame_skip=1))
         assert effect("payload").targets(robot) == ("link",)
         assert effect("payload", at_end=True).targets(robot) == ()
+
+
+def test_friction_that_falls_with_speed_brakes_as_it_says():
+    model = arm().model
+    models = written("viscous_friction", {"rail": 3.0}, rise=-0.25)
+    model.dof_damping[2] = models.read("dof_damping", (2,)).item()
+    model.dof_dampingpoly[2] = [models.read("dof_dampingpoly", (2, i)).item() for i in (0, 1)]
+    data = mujoco.MjData(model)
+    for v in (-2.0, 0.5):
+        data.qvel[2] = v
+        mujoco.mj_forward(model, data)
+        assert data.qfrc_damper[2] == pytest.approx(-3.0 * v * (1 - 0.25 * abs(v)))
 
 
 def test_a_spring_that_hardens_pulls_as_it_says():

@@ -18,7 +18,7 @@ from .candidates import candidates, concluded
 from .confusion import settled
 from .credit import credit_of, unit_credit, worthwhile
 from .divergence import divergence_alarms, diverges_throughout
-from .doubts import baseless, doubts, numerical
+from .doubts import alike, baseless, doubts, numerical, unsigned
 from .experiment import experiments
 from .figures import figures
 from .found import Found
@@ -92,7 +92,12 @@ def assemble(
         diverges=diverges_throughout(rollouts),
         odd=odd_runs(errors),
         baseless=bool(by_integration) or baseless(found.effects, units),
-        doubts=[*doubts(found.effects, units, prepared), *worse_rollouts(rollouts)],
+        doubts=[
+            *doubts(found.effects, units, prepared),
+            *alike(best.units, system.robot),
+            *unsigned(best, prepared),
+            *worse_rollouts(rollouts),
+        ],
         alpha=alpha,
     )
     if verdict == "unknown":

@@ -30,7 +30,9 @@ def candidates(
     # what got another frequency in a later round is the same unit of the first
     later = {str(unit): unit for unit in used - set(seen.units)}
     same = {unit: later.get(str(unit), unit) for unit in seen.units}
-    strongest = {same[unit]: value for unit, value in seen.best(1.0).items()}
+    strongest: dict[Unit, tuple[float, float]] = {}
+    for unit, value in seen.best(1.0).items():  # the strongest first
+        strongest.setdefault(same[unit], value)
     detectable = {same[unit]: value for unit, value in seen.detectable(alpha).items()}
     fitted = {m.units[0]: m for m in selection.tried if len(m.units) == 1}
     excess = max(seen.residual - seen.effective, 1e-9)

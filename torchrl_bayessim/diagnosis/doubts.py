@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["baseless", "doubts", "numerical"]
+__all__ = ["alike", "baseless", "doubts", "numerical", "unsigned"]
 
 from collections.abc import Sequence
 
@@ -10,12 +10,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects.joints import Armature
+from ..effects.joints import Armature, CoulombFriction
 from ..effects.robot import Robot
 from ..effects.transmission import servo_damping
 from .cells import plain
-from .objective import Unit
+from .model import Model, as_good, judged
+from .objective import Point, Unit
 from .preparation import Prepared
+from .refit import refit
 from .report import Finding
 
 _EDGE = 0.98  # of the largest strength that is looked for
@@ -43,6 +45,44 @@ def doubts(effects: Sequence[Finding], units: Sequence[Unit], prepared: Prepared
         found.append(
             "no command ever changes: causes that would show under others cannot be told apart"
         )
+    return found
+
+
+def alike(units: Sequence[Unit], robot: Robot) -> list[str]:
+    """Return an alarm if two causes act alike at one joint: together they imitate many a third.
+
+    Laws of friction add up, in the usual model too.
+    """
+    found = {}
+    for i, one in enumerate(units):
+        for other in units[:i]:
+            groups = {one.effect.group, other.effect.group}
+            if len(groups) > 1 or CoulombFriction.group in groups or one.name == other.name:
+                continue
+            if one.joint(robot) == other.joint(robot):
+                names = f"{plain(other.name)} and {plain(one.name)}"
+                found[names] = f"{names} at {one.where} act alike: they may stand for another cause"
+    return list(found.values())
+
+
+def unsigned(best: Model, prepared: Prepared) -> list[str]:
+    """Return an alarm for effects of which the data tell the size, but not the sign.
+
+    Of a tilt along a joint's axis, only its cosine matters.
+    """
+    point, found = best.fit.point, []
+    signed = [unit for unit in best.units if unit.low < 0 and point.strengths[unit]]
+    for unit in signed:
+        other = Point(point.z, {**point.strengths, unit: -point.strengths[unit]})
+        fit = refit(prepared.sets["train"], [other], iterations=0)
+        (mirrored,) = judged(prepared.sets["train"], prepared.sets["validation"], fit)
+        if as_good(best, mirrored):
+            size = abs(unit.actual(point.strengths[unit]))
+            unit_of = unit.measured_in(prepared.predictor.system.robot)
+            found.append(
+                f"{plain(unit.name)} at {unit.where} is {size:.3g} or {-size:.3g} {unit_of}: "
+                "these data do not tell its sign"
+            )
     return found
 
 

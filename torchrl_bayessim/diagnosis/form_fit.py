@@ -13,41 +13,38 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..effects.disturbance import Cogging, PeriodicDisturbance
-from ..effects.joints import ParallelSpring
+from ..effects.effect import Reach
 from ..effects.units import slides
 from .model import LIKELY, Model, judged
 from .objective import Objective, Point, Unit
 from .refit import refit, with_prior
 
-Array = NDArray[np.float64]
 _STEPS = 4  # of Gauss and Newton
-_MOVED = 0.05  # rad by which a force is moved to see what that does, at its farthest row
-_FARTHEST = 0.5  # rad in one step: sines are not linear
-_HARDER = 0.05  # by which a spring's stiffness grows, to see what that does, at its farthest row
+_FARTHEST = 10.0  # times the change that shows, in one step: laws are not linear in these numbers
+_MORE = 2.0  # deviance that a further number gains by chance
 
 
 @dataclass(frozen=True)
 class _Shift:
-    """One number of one unit that can be moved, and by how much to see what it does."""
+    """One number of one unit that can be moved: how far to see what that does, and at most."""
 
     unit: Unit
     number: str
     width: float
-    least: float = -np.inf
+    least: float
+    most: float
 
 
 def with_fitted_forms(train: Objective, validation: Objective, model: Model) -> Model:
-    """Return the model with its periodic forces' frequencies and phases, and its springs, fitted.
+    """Return the model with what its effects have free beside their strengths fitted, too.
 
-    A force ``s sin(a + φ)`` of angle ``a = 2πft`` or ``a = kq`` is linear in small changes of ``φ``
-    and of ``f`` or ``k``, and that of a spring, ``−s q (1 + h q²)``, in ``h``; these are solved for
-    together with parameters and strengths. On a hinge ``k`` counts whole periods per turn and stays
-    as it is. The model itself comes back where nothing is gained that chance would not often give.
+    What is free (`Effect.free`: the frequency of a periodic force, how a spring hardens) moves the
+    innovations linearly where it changes little, and is solved for together with parameters and
+    strengths. The model itself comes back where nothing is gained that chance would not often give.
     """
     best = model
+    needed = LIKELY + _MORE * (len(_shifts(train, model)) - 1)
     for _ in range(_STEPS):
         shifts = _shifts(train, best)
         if not shifts:
@@ -59,38 +56,37 @@ def with_fitted_forms(train: Objective, validation: Objective, model: Model) -> 
         best = judged(train, validation, [fitted])[0]
         if gained < LIKELY:
             break
-    return best if model.fit.cost - best.fit.cost > LIKELY else model
+    return best if model.fit.cost - best.fit.cost > needed else model
 
 
 def _shifts(train: Objective, model: Model) -> list[_Shift]:
     """Return what can be moved."""
+    return [
+        _Shift(unit, number, *bounds)
+        for unit in model.units
+        for number, bounds in unit.effect.free(_reach(train, unit)).items()
+    ]
+
+
+def _reach(train: Objective, unit: Unit) -> Reach:
+    """Return how far the robot went where a unit acts, at any of the joints if at several."""
     robot, segments = train.predictor.system.robot, train.segments
-    shifts = []
-    for unit in model.units:
-        if isinstance(unit.effect, PeriodicDisturbance):
-            latest = float(np.abs(segments.time).max())
-            shifts.append(_Shift(unit, "frequency", _MOVED / (2 * np.pi * max(latest, 1e-9))))
-        elif isinstance(unit.effect, ParallelSpring):
-            where = segments.qpos[..., list(robot.qpos_index)][..., np.array(unit.direction) != 0]
-            farthest = float(np.abs(where).max())
-            shifts.append(_Shift(unit, "hardening", _HARDER / max(farthest, 1e-9) ** 2, 0.0))
-            continue
-        elif isinstance(unit.effect, Cogging):
-            joint = unit.joint(robot)
-            if slides(robot, joint):
-                where = segments.qpos[..., robot.qpos_index[joint]]
-                farthest = float(np.abs(where).max())
-                shifts.append(_Shift(unit, "number", _MOVED / max(farthest, 1e-9)))
-        else:
-            continue
-        shifts.append(_Shift(unit, "phase", _MOVED))
-    return shifts
+    joint = unit.joint(robot)
+    joints = [joint] if joint >= 0 else list(range(len(robot.joints)))
+    places = [robot.qpos_index[j] for j in joints], [robot.dof_index[j] for j in joints]
+    position, velocity = (
+        float(np.abs(states[..., list(columns)]).max(initial=0.0))
+        for states, columns in zip((segments.qpos, segments.qvel), places, strict=True)
+    )
+    time = float(np.abs(segments.time).max())
+    return Reach(position, velocity, time, slides(robot, joint))
 
 
 def _moved(train: Objective, model: Model, shifts: Sequence[_Shift]) -> Point:
     """Return where one step of Gauss and Newton leads."""
     fit, size = model.fit, len(model.fit.point.z)
-    tries = [_with(fit.point, [shift], [shift.width]) for shift in shifts]
+    widths = [_inwards(shift) for shift in shifts]
+    tries = [_with(fit.point, [s], [w]) for s, w in zip(shifts, widths, strict=True)]
     changes = (train(tries) - fit.innovations).reshape(len(shifts), -1)
     columns = np.concatenate([fit.jacobian, changes.T], axis=1)
     left = np.r_[fit.innovations.ravel(), fit.point.z]
@@ -99,17 +95,25 @@ def _moved(train: Objective, model: Model, shifts: Sequence[_Shift]) -> Point:
         unit: unit.inside(fit.point.strengths[unit] + unit.high * step[size + i])
         for i, unit in enumerate(fit.units)
     }
-    reach = _FARTHEST / _MOVED
-    times = np.clip(step[size + len(fit.units) :], -reach, reach)
-    widths = [shift.width * float(t) for shift, t in zip(shifts, times, strict=True)]
-    return _with(Point(fit.point.z + step[:size], strengths), shifts, widths)
+    times = np.clip(step[size + len(fit.units) :], -_FARTHEST, _FARTHEST).tolist()
+    steps = [width * time for width, time in zip(widths, times, strict=True)]
+    return _with(Point(fit.point.z + step[:size], strengths), shifts, steps)
+
+
+def _inwards(shift: _Shift) -> float:
+    """Return the change that shows, away from the end that the number may be at."""
+    return -shift.width if _value(shift) + shift.width > shift.most else shift.width
+
+
+def _value(shift: _Shift) -> float:
+    return float(shift.unit.effect.form[shift.number])
 
 
 def _with(point: Point, shifts: Sequence[_Shift], widths: Sequence[float]) -> Point:
     """Return the point with effects whose numbers are moved."""
     forms = {shift.unit: dict(shift.unit.effect.form) for shift in shifts}
     for shift, width in zip(shifts, widths, strict=True):
-        moved = forms[shift.unit][shift.number] + width
-        forms[shift.unit][shift.number] = max(moved, shift.least)
+        moved = float(np.clip(_value(shift) + width, shift.least, shift.most))
+        forms[shift.unit][shift.number] = moved
     others = {u: replace(u, effect=type(u.effect)(**form)) for u, form in forms.items()}
     return Point(point.z, {others.get(u, u): s for u, s in point.strengths.items()})

@@ -97,6 +97,7 @@ def select(
         models = judged(train, validation, explanations(train, now))
         tried += models
         better = _needed_only(start, best, _chosen(best, models), models)
+        better = _one_of_another_form((train, validation), best, better, models)
         if better is None or not identified(start, best, better, models):
             break
         best = with_fitted_forms(train, validation, _exactly(train, validation, better))
@@ -218,6 +219,21 @@ def _needed_only(
     if smaller is None or identified(start, smaller, better, models):
         return better
     return smaller
+
+
+def _one_of_another_form(
+    sets: tuple[Objective, Objective], base: Model, better: Model | None, models: Sequence[Model]
+) -> Model | None:
+    """Return a single effect in a fitted form, where several explain no more than that."""
+    added = {u.name for u in better.units if u not in base.units} if better is not None else set()
+    if better is None or len(added) < 2:
+        return better
+    single = [m for m in models if len({u.name for u in m.units if u not in base.units}) == 1]
+    smaller = _chosen(base, single)
+    if smaller is None:
+        return better
+    fitted = with_fitted_forms(*sets, smaller)
+    return fitted if fitted is not smaller and as_good(better, fitted) else better
 
 
 def _eliminated(train: Objective, validation: Objective, model: Model) -> tuple[Model, list[Model]]:

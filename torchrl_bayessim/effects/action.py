@@ -19,16 +19,20 @@ __all__ = [
     "Saturation",
 ]
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
-from .effect import ActionEffect, Effect, Memory, Now
+from .effect import ActionEffect, Effect, Memory, Now, Reach
 from .history import delayed, empty_line, filled, read_line
-from .laws import decay, quantized, within
+from .laws import bent, decay, quantized, within
 from .robot import Robot
-from .transmission import ServoDeadBand, servos
+from .transmission import ServoDeadBand, ServoGain, servos
 
 _LONGEST = 8  # control steps that a delay line remembers
+_SOFT = 0.5  # of a bend: ``v / √(1 + (v / l)²)``
+_SOFTER: Mapping[str, tuple[float, float, float]] = {"softness": (0.02, 0.1, 1.0)}
 
 
 class ActionDelay(ActionEffect):
@@ -130,29 +134,38 @@ class DeadBand(ActionEffect):
     """Small commands do nothing and all lose ``s``: ``sgn(u) max(|u| − s, 0)``.
 
     In units of the command, 0 to 40 % of ``u_max``. A servo's band is around its target; see
-    `ServoDeadBand`.
+    `ServoDeadBand`. What is lost of a command may bend into ``s`` as a soft `Saturation` does.
 
     Args:
         damped: Of servos: whether their damping is lost within the band too.
+        softness: Of motors: of the bend; 0 for a corner. A diagnosis fits it.
     """
 
     name, unit, group, memoryless = "dead_band", "command", "dead zone", True
 
-    def __init__(self, *, damped: bool = True) -> None:
-        self.damped = damped
+    def __init__(self, *, damped: bool = True, softness: float = 0.0) -> None:
+        self.damped, self.softness = damped, softness
 
     def forms(self, seconds: float) -> tuple[Effect, ...]:
-        """Return the band with and without the damping."""
+        """Return the band with and without the damping, and a soft one."""
         del seconds
-        return DeadBand(), DeadBand(damped=False)
+        return DeadBand(), DeadBand(damped=False), DeadBand(softness=_SOFT)
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return a soft one's softness."""
+        del reach
+        return _SOFTER if self.softness else {}
 
     def on(self, robot: Robot) -> Effect:
         """Return the band of servos, where there is one."""
-        return ServoDeadBand(damped=self.damped) if servos(robot) else self
+        if servos(robot) and not self.softness:
+            return ServoDeadBand(damped=self.damped)
+        return self
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
-        """Return the actuators' names, none if it is of servos only."""
-        return super().targets(robot) if self.damped else ()
+        """Return the actuators' names, none if it is of servos only, or of motors and they are."""
+        other = self.softness and servos(robot)
+        return super().targets(robot) if self.damped and not other else ()
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.4 ``u_max``."""
@@ -163,29 +176,35 @@ class DeadBand(ActionEffect):
     ) -> tuple[Tensor, Memory]:
         """Return what exceeds the band."""
         del now
-        return action - action.clamp(-strength, strength), memory
+        return action - bent(action, strength, self.softness), memory
 
 
 class Saturation(ActionEffect):
     """Strong commands are cut: ``clip(u, ±(1 − s) u_max)``, where ``u_max`` bounds commands.
 
     A fraction, 0 to 0.9: what the largest command loses. A soft one, such as an iron core's, bends
-    all along, ``u / √(1 + ((1 − s)⁻² − 1) (u / u_max)²)``, where the largest loses as much.
+    all along, ``u (1 + |u / l|ᵖ)^(−1/p)`` with ``p = 1 / softness``, where the largest command
+    loses as much: ``(l / u_max)⁻ᵖ = (1 − s)⁻ᵖ − 1``.
 
     Args:
-        soft: Whether it is a soft one.
+        softness: Of the bend; 0 for a corner. A diagnosis fits it.
     """
 
     name, unit, group, memoryless = "saturation", "fraction", "gain", True
     limit = True
 
-    def __init__(self, *, soft: bool = False) -> None:
-        self.soft = soft
+    def __init__(self, softness: float = 0.0) -> None:
+        self.softness = softness
 
     def forms(self, seconds: float) -> tuple[Effect, ...]:
         """Return the hard and the soft one."""
         del seconds
-        return Saturation(), Saturation(soft=True)
+        return Saturation(), Saturation(_SOFT)
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return a soft one's softness."""
+        del reach
+        return _SOFTER if self.softness else {}
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.9."""
@@ -195,18 +214,46 @@ class Saturation(ActionEffect):
         self, action: Tensor, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Tensor, Memory]:
         """Return the command within its limit."""
-        most = now.robot.command_scale.to(action)
-        limit = (1 - strength) * most
-        cut = action.clamp(-limit, limit)
-        if self.soft:
-            cut = action / (1 + ((1 - strength) ** -2 - 1) * (action / most) ** 2).sqrt()
-        return torch.where(strength > 0, cut, action), memory
+        left, most = 1 - strength, now.robot.command_scale.to(action)
+        if self.softness:
+            power = 1 / self.softness
+            left = (left**-power - 1).clamp(min=1e-12) ** -self.softness
+        return torch.where(strength > 0, bent(action, left * most, self.softness), action), memory
 
 
 class ActionGain(ActionEffect):
-    """The drive is stronger or weaker than told: ``(1 + s) u``; a fraction, −0.5 to 0.5."""
+    """The drive is stronger or weaker than told: ``(1 + s (1 + b |u| / u_max)) u``.
+
+    A fraction, −0.5 to 0.5. A servo goes to another place then; of one that is as strong or as soft
+    as that see `ServoGain`.
+
+    Args:
+        bend: ``b``; 0 where large commands are as wrong as small ones. A diagnosis fits it.
+        servo: Of servos: whether it is their force that is scaled.
+    """
 
     name, unit, group, memoryless = "action_gain", "fraction", "gain", True
+
+    def __init__(self, bend: float = 0.0, *, servo: bool = False) -> None:
+        self.bend, self.servo = bend, servo
+
+    def forms(self, seconds: float) -> tuple[Effect, ...]:
+        """Return the factor on commands, and that on the force of servos."""
+        del seconds
+        return ActionGain(), ActionGain(servo=True)
+
+    def on(self, robot: Robot) -> Effect:
+        """Return the gain of servos, where it is that."""
+        return ServoGain() if self.servo and servos(robot) else self
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the actuators' names, none if it is of servos only."""
+        return () if self.servo else super().targets(robot)
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the bend."""
+        del reach
+        return {"bend": (0.05, -0.8, 0.8)}
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return −0.5 and 0.5."""
@@ -216,7 +263,9 @@ class ActionGain(ActionEffect):
         self, action: Tensor, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Tensor, Memory]:
         """Return the scaled command."""
-        del now
+        if self.bend:
+            share = action.abs() / now.robot.command_scale.to(action)
+            strength = strength * (1 + self.bend * share)
         return action * (1 + strength), memory
 
 
@@ -238,16 +287,22 @@ class ActionBias(ActionEffect):
 
 
 class BatterySag(ActionEffect):
-    """The drive weakens with time: ``u (1 − s min(t / T, 1.5))``; a fraction, 0 to 0.6.
+    """The drive weakens with time: ``u (1 − s x (1 + b x))``, ``x = min(t / T, 1.5)``; 0 to 0.6.
 
     Args:
         seconds: ``T``, after which the fraction ``s`` is lost.
+        bend: ``b``; negative where it weakens ever less. A diagnosis fits it.
     """
 
     name, unit, group, memoryless = "battery_sag", "fraction", "gain", True
 
-    def __init__(self, seconds: float = 10.0) -> None:
-        self.seconds = seconds
+    def __init__(self, seconds: float = 10.0, bend: float = 0.0) -> None:
+        self.seconds, self.bend = seconds, bend
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the bend, so far that nothing comes back within the runs."""
+        longest = min(max(reach.time, 1e-9) / self.seconds, 1.5)
+        return {"bend": (0.05, -0.5 / longest, 1.0)}
 
     def forms(self, seconds: float) -> tuple[Effect, ...]:
         """Return what is lost within the runs, if they are shorter than ``T``."""
@@ -262,7 +317,7 @@ class BatterySag(ActionEffect):
     ) -> tuple[Tensor, Memory]:
         """Return the command that the battery still supports."""
         spent = (now.time.to(action) / self.seconds).clamp(max=1.5)
-        return action * (1 - strength * spent), memory
+        return action * (1 - strength * spent * (1 + self.bend * spent)), memory
 
 
 class PacketDrop(ActionEffect):

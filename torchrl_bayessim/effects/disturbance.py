@@ -12,9 +12,12 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from .effect import ForceEffect, Memory, Now
+from .effect import ForceEffect, Memory, Now, Reach
 from .laws import within
 from .robot import Robot
+
+_MOVED = 0.05  # rad by which an angle is moved to see what that does, at its farthest
+_ANY = -math.inf, math.inf
 
 
 class ConstantForce(ForceEffect):
@@ -46,6 +49,11 @@ class PeriodicDisturbance(ForceEffect):
     def __init__(self, frequency: float = 1.0, phase: float = 0.0) -> None:
         self.frequency, self.phase = frequency, phase
 
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return both."""
+        slower = _MOVED / (2 * math.pi * max(reach.time, 1e-9))
+        return {"frequency": (slower, *_ANY), "phase": (_MOVED, *_ANY)}
+
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.3 ``F_max``."""
         return within(robot.force_scale, 0.0, 0.3)
@@ -70,6 +78,11 @@ class Cogging(ForceEffect):
 
     def __init__(self, number: float = 6, phase: float = 0.0) -> None:
         self.number, self.phase = number, phase
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the phase, and a slide's number; a hinge has whole periods per turn."""
+        wider = {"number": (_MOVED / max(reach.position, 1e-9), *_ANY)} if reach.slides else {}
+        return wider | {"phase": (_MOVED, *_ANY)}
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the joints' names."""

@@ -33,13 +33,14 @@ __all__ = [
     "Memory",
     "ModelEffect",
     "Now",
+    "Reach",
     "SensorEffect",
 ]
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from types import SimpleNamespace
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 from torch import Tensor
 
@@ -57,6 +58,22 @@ generalised force that actuators exert ``(*batch, J)``; in actuator order: ``com
 ``actuator_gain``, the force per unit of command ``(*batch, A)``; and ``timestep``, the seconds that
 a force is held (a float).
 """
+
+
+class Reach(NamedTuple):
+    """How far a robot went where an effect acts: what the smallest change that shows depends on.
+
+    Attributes:
+        position: Largest distance from zero, rad or m.
+        velocity: Largest speed, rad/s or m/s.
+        time: Seconds since the episode began, at most.
+        slides: Whether the joint is a slide.
+    """
+
+    position: float
+    velocity: float
+    time: float
+    slides: bool
 
 
 class Effect(ABC):
@@ -112,6 +129,18 @@ class Effect(ABC):
         """
         del seconds
         return (self,)
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the options that a diagnosis fits once the effect is in the model; default none.
+
+        Args:
+            reach: How far the robot went.
+
+        Returns:
+            By the option's name, a change that shows a little, its least and its largest value.
+        """
+        del reach
+        return {}
 
     @abstractmethod
     def targets(self, robot: Robot) -> tuple[str, ...]:

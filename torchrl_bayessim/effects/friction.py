@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from .effect import ForceEffect, Memory, Now
+from .effect import ForceEffect, Memory, Now, Reach
 from .laws import within
 from .robot import Robot
 
@@ -33,6 +33,10 @@ class StribeckFriction(ForceEffect):
     def __init__(self, speed: float = 0.2) -> None:
         self.speed = speed
 
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the speed, up to a quarter of the largest: beyond it friction hardly fades."""
+        return {"speed": (0.05 * self.speed, 0.02, max(0.25 * reach.velocity, self.speed))}
+
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.3 ``F_max``."""
         return within(robot.force_scale, 0.0, 0.3)
@@ -45,9 +49,21 @@ class StribeckFriction(ForceEffect):
 
 
 class QuadraticDrag(ForceEffect):
-    """Drag ``−s v |v|``, as a damping of ``s |v|``; N m s²/rad², up to 30 % of ``F_max/v_max²``."""
+    """Drag ``−s v |v|ᵖ⁻¹``, ``p = 2``, as a damping; N m s²/rad², up to 30 % of ``F_max/v_max²``.
+
+    Args:
+        power: ``p``; a diagnosis fits it.
+    """
 
     name, unit, group = "quadratic_drag", "N m s²/rad²", "friction"
+
+    def __init__(self, power: float = 2.0) -> None:
+        self.power = power
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the power, nearer to 2 than to that of other friction."""
+        del reach
+        return {"power": (0.02, 1.5, 3.0)}
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.3 ``F_max / v_max²``."""
@@ -57,7 +73,7 @@ class QuadraticDrag(ForceEffect):
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
         """Return the damping at this speed."""
-        return {"damping": strength * now.velocity.abs()}, memory
+        return {"damping": strength * now.velocity.abs() ** (self.power - 1)}, memory
 
 
 class LoadDependentFriction(ForceEffect):

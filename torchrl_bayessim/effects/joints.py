@@ -8,16 +8,19 @@ from __future__ import annotations
 
 __all__ = ["Armature", "CoulombFriction", "ParallelSpring", "ViscousFriction"]
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from .effect import Fields, ModelEffect
+from .effect import Fields, ModelEffect, Reach
 from .laws import within
 from .robot import Robot
 
-_SQUARE = 1  # MuJoCo's column of the stiffness that grows with the square of the angle
+# MuJoCo's damping in proportion to speed, and stiffness in proportion to the angle's square
+_BY_SPEED, _BY_SQUARE = ("dof_dampingpoly", 0), ("jnt_stiffnesspoly", 1)
+_STEP = 0.05  # of a force at the farthest, to see what a change of the law does
 
 
 class _Joint(ModelEffect):
@@ -53,9 +56,27 @@ class CoulombFriction(_Joint):
 
 
 class ViscousFriction(_Joint):
-    """Damping ``−s v``; N m s/rad, up to 30 % of ``F_max`` at a quarter of ``v_max``."""
+    """Damping ``−s v (1 + r |v|)``; N m s/rad, up to 30 % of ``F_max`` at a quarter of ``v_max``.
+
+    Args:
+        rise: ``r``, s/rad or s/m; negative for grease that thins. A diagnosis fits it.
+    """
 
     name, unit, group, field = "viscous_friction", "N m s/rad", "friction", "dof_damping"
+
+    def __init__(self, rise: float = 0.0) -> None:
+        self.rise = rise
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the rise: from half to twice the damping at the largest speed."""
+        slowest = 1 / max(reach.velocity, 1e-9)
+        return {"rise": (_STEP * slowest, -0.5 * slowest, slowest)}
+
+    def write(self, fields: Fields, strength: Tensor, robot: Robot) -> None:
+        """Add to the joints' damping, and to that in proportion to speed."""
+        super().write(fields, strength, robot)
+        if self.rise:
+            _add(fields, _BY_SPEED, self._indices(robot), self.rise * strength)
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 1.2 ``F_max / v_max``."""
@@ -74,13 +95,15 @@ class ParallelSpring(_Joint):
     def __init__(self, hardening: float = 0.0) -> None:
         self.hardening = hardening
 
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the hardening."""
+        return {"hardening": (_STEP / max(reach.position, 1e-9) ** 2, 0.0, float("inf"))}
+
     def write(self, fields: Fields, strength: Tensor, robot: Robot) -> None:
         """Add to the joints' stiffness, and to that in proportion to the square of the angle."""
         super().write(fields, strength, robot)
         if self.hardening:
-            for j, index in enumerate(self._indices(robot)):
-                entry = "jnt_stiffnesspoly", (index, _SQUARE)
-                fields[entry] = fields[entry] + self.hardening * strength[..., j]
+            _add(fields, _BY_SQUARE, self._indices(robot), self.hardening * strength)
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and ``F_max`` per range of positions."""
@@ -100,3 +123,11 @@ class Armature(_Joint):
         """Return 0 and the joint's inertia at the model's reference position."""
         inertia = robot.require_model().dof_M0[list(robot.dof_index)]
         return within(torch.from_numpy(inertia), 0.0, 1.0)
+
+
+def _add(fields: Fields, column: tuple[str, int], indices: tuple[int, ...], values: Tensor) -> None:
+    """Add values ``(*batch, J)`` to a column of a field."""
+    name, number = column
+    for j, index in enumerate(indices):
+        entry = name, (index, number)
+        fields[entry] = fields[entry] + values[..., j]

@@ -23,7 +23,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from .effect import ForceEffect, Memory, Now
+from .effect import ForceEffect, Memory, Now, Reach
 from .history import filled
 from .robot import Robot
 
@@ -84,10 +84,21 @@ class TorqueSpeedLimit(_Transmission):
     joint's velocity scale.
     A number from 0 to 6: the straight line of a DC motor between stall and no load. A model does
     not tell how fast its motors are; 1.2 is as fast as the velocity scale, 6 a fifth of that.
+
+    Args:
+        power: Of ``s |v| / v_max`` in the law; 1 for the straight line. A diagnosis fits it.
     """
 
     name, unit, group = "torque_speed_limit", "fraction", "gain"
     limit = True
+
+    def __init__(self, power: float = 1.0) -> None:
+        self.power = power
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the power."""
+        del reach
+        return {"power": (0.02, 0.5, 4.0)}
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 6."""
@@ -100,10 +111,41 @@ class TorqueSpeedLimit(_Transmission):
         """Return the change of commands."""
         largest, fastest, _ = now.robot.actuator_limits
         speed = now.actuator_velocity / fastest
-        share = (1.2 - strength * speed.abs()).clamp(0.05, 1.0)
+        share = (1.2 - (strength * speed.abs()) ** self.power).clamp(0.05, 1.0)
         limited = now.actuator_force.clamp(-share * largest, share * largest)
         drives = (share < 1) & (now.actuator_force * speed > 0)
         return _change(torch.where(drives, limited, now.actuator_force), now), memory
+
+
+class ServoGain(_Transmission):
+    """A servo is stiffer or softer than told, its damping too: its force is ``(1 + s) F``.
+
+    A fraction, −0.5 to 0.5. In the logs it is as if all that the servo moves were lighter.
+
+    Args:
+        servo: Always; what tells it from a factor on the target, `ActionGain`.
+    """
+
+    name, unit, group = "action_gain", "fraction", "gain"
+
+    def __init__(self, *, servo: bool = True) -> None:
+        self.servo = servo
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the actuators' names, none if no servo is among them."""
+        return super().targets(robot) if servos(robot) else ()
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return −0.5 and 0.5, and nothing for motors."""
+        half = torch.zeros(len(robot.actuators), dtype=torch.float64)
+        half[servos(robot)] = 0.5
+        return -half, half
+
+    def forces(
+        self, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Mapping[str, Tensor], Memory]:
+        """Return the change of commands."""
+        return {"command": strength * now.actuator_force / now.actuator_gain}, memory
 
 
 class ServoDeadBand(_Transmission):
