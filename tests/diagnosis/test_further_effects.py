@@ -1,5 +1,7 @@
 """What makes a further effect more than a stopgap."""
 
+from types import SimpleNamespace
+
 import pytest
 from plain_models import A, C, Unit, plain
 
@@ -44,6 +46,21 @@ def test_what_is_hardly_a_share_of_the_gap_is_named_if_one_effect_takes_all_of_i
     """Less than a hundredth, but five times the noise."""
     start, base, better = plain([], 1e6), plain(first, 2400.0), plain([*first, more], left)
     assert identified(start, base, better, [better]) == added
+
+
+@pytest.mark.parametrize(("timestep", "added"), [(0.5, True), (2.0, False)])
+def test_a_delay_beside_a_cause_is_one_if_it_is_longer_than_a_time_step(timestep, added):
+    class Delay(Unit):
+        effect = SimpleNamespace(group="timing")
+
+        def actual(self, strength):
+            return strength
+
+    start, base, better = (
+        plain(units, left)
+        for units, left in (([], 1e6), ([A], 2400.0), ([A, Delay("action_delay")], 450.0))
+    )
+    assert identified(start, base, better, [better], timestep=timestep) == added
 
 
 def test_what_a_force_a_little_off_would_leave_is_no_cause_of_its_own():

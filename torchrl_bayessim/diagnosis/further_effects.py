@@ -10,11 +10,13 @@ from __future__ import annotations
 
 __all__ = ["identified", "nothing_left"]
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from ..effects.action import ActionDelay
+from ..effects.sensors import SensorDelay
 from .model import Model, as_good, gain
 
 _SHARE = 0.1  # of the gap: what an effect that could be another must remove to be kept
@@ -23,12 +25,20 @@ _LONE, _ALONE = 0.25, 4.0  # the same where it removes so many times what any ot
 _REMAINS = 0.01  # of the gap: not worth another effect
 _NUMERICAL = 3e-4  # of the gap: what a force that is 2 % off, by the integrator, may leave
 _VISIBLE = 1.2  # mean squared innovation that shows however small a share of the gap
+_DELAYS = ActionDelay.name, SensorDelay.name
 _WRONG = 1.5  # mean squared innovation of a base that something is missing from
 _SURELY, _NOTHING = 50.0, 0.2  # gain, and share of what the base leaves: it was just this
 _DIFFERENT = 0.1  # of the change that an effect makes: what another makes differently
 
 
-def identified(start: Model, base: Model, better: Model, models: Sequence[Model]) -> bool:
+def identified(
+    start: Model,
+    base: Model,
+    better: Model,
+    models: Sequence[Model],
+    *,
+    timestep: float = math.inf,
+) -> bool:
     """Return whether what is added to a base with effects is more than a stopgap.
 
     Args:
@@ -36,6 +46,7 @@ def identified(start: Model, base: Model, better: Model, models: Sequence[Model]
         base: With the effects that there are already.
         better: With further ones.
         models: All that were tried on the base.
+        timestep: Of the simulator, s: what is later than that no integrator is.
     """
     if not base.units:
         return True
@@ -54,10 +65,18 @@ def identified(start: Model, base: Model, better: Model, models: Sequence[Model]
     just_this = gain(base, better) > _SURELY and removed > 1.0 - _NOTHING
     if _leaves_less(start, base, _REMAINS):
         # a simulator that integrates otherwise is late, too, by a part of its time step
-        second = len({unit.name for unit in base.units}) == 1 and ActionDelay.group not in added
+        second = len({unit.name for unit in base.units}) == 1
+        second &= ActionDelay.group not in added or _later(base, better, timestep)
         if not second or not (just_this or (lone and removed > _REST)):
             return False
     return (before > _WRONG or just_this) and not _rivalled(base, better, models)
+
+
+def _later(base: Model, better: Model, timestep: float) -> bool:
+    """Return whether a delay that is added is longer than a time step."""
+    strengths = better.fit.point.strengths
+    delays = [u for u in strengths if u not in base.units and u.name in _DELAYS]
+    return any(unit.actual(strengths[unit]) > timestep for unit in delays)
 
 
 def _rivalled(base: Model, better: Model, models: Sequence[Model]) -> bool:

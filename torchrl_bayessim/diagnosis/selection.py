@@ -13,6 +13,7 @@ __all__ = ["Selection", "parts", "select", "without_idle"]
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -81,6 +82,8 @@ def select(
     """
     start = judged(train, validation, [nominal])[0]
     best, tried, screens, p_values = start, [start], [], []
+    timestep = float(train.predictor.system.task.model.opt.timestep)
+    worth = partial(identified, start, timestep=timestep)
     for round_number in range(_MOST):
         progress(f"screening {len(units)} effects, round {round_number + 1}")
         enough = nothing_left(start, best)
@@ -96,9 +99,9 @@ def select(
         progress("fitting explanations")
         models = judged(train, validation, explanations(train, now))
         tried += models
-        better = _needed_only(start, best, _chosen(best, models), models)
+        better = _needed_only(best, _chosen(best, models), models, worth=worth)
         better = _one_of_another_form((train, validation), best, better, models)
-        if better is None or not identified(start, best, better, models):
+        if better is None or not worth(best, better, models):
             break
         best = with_fitted_forms(train, validation, _exactly(train, validation, better))
         new = [unit for unit in best.units if unit not in better.units]
@@ -206,17 +209,14 @@ def _coarser(model: Model, models: Sequence[Model]) -> list[Model]:
 
 
 def _needed_only(
-    start: Model,
-    base: Model,
-    better: Model | None,
-    models: Sequence[Model],
+    base: Model, better: Model | None, models: Sequence[Model], *, worth: Callable[..., bool]
 ) -> Model | None:
     """Return the best model, or the one with a single new effect if more are a stopgap."""
     if better is None or len({u.name for u in better.units if u not in base.units}) < 2:
         return better
     single = [m for m in models if len({u.name for u in m.units if u not in base.units}) == 1]
     smaller = _chosen(base, single)
-    if smaller is None or identified(start, smaller, better, models):
+    if smaller is None or worth(smaller, better, models):
         return better
     return smaller
 

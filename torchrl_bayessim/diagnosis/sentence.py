@@ -17,6 +17,10 @@ from .validation import NEGLIGIBLE, PARTIAL, SHOWN
 _MUCH = 0.2  # of the error, to say that it sits there
 # what readers know a law by, beside its strength
 _FORMS = {"frequency": ", {:.3g} Hz", "number": ", {:.3g} per turn or 2π m"}
+_BENT = {
+    "hardening": ", hardening by {:.2g} x²", "rise": ", and {:+.2g} of it per unit of speed",
+    "softness": ", softness {:.2g}", "bend": ", bent by {:+.2g}",
+}  # fmt: skip
 
 
 def sentence(
@@ -179,7 +183,9 @@ def _described(effect: Finding) -> str:
 
 
 def _law(form: Mapping[str, Any]) -> str:
-    return "".join(text.format(form[name]) for name, text in _FORMS.items() if name in form)
+    """Return what tells a law from others of its name: how fast it oscillates, how it bends."""
+    shown = [text.format(form[name]) for name, text in _FORMS.items() if name in form]
+    return "".join(shown + [t.format(form[name]) for name, t in _BENT.items() if form.get(name)])
 
 
 def _place(where: str) -> str:

@@ -70,8 +70,8 @@ def effect(name: str, **options: Any) -> Effect:
         **options: Of its kind, such as the ``frequency`` of a ``periodic_disturbance``.
 
     Example:
-        >>> effect("periodic_disturbance", frequency=2.0)
-        PeriodicDisturbance(frequency=2.0, phase=0.0)
+        >>> effect("stribeck_friction", speed=0.1)
+        StribeckFriction(speed=0.1)
 
     Raises:
         KeyError: The catalogue has no such effect.

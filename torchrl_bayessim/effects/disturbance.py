@@ -20,6 +20,27 @@ _MOVED = 0.05  # rad by which an angle is moved to see what that does, at its fa
 _ANY = -math.inf, math.inf
 
 
+_OVERTONES: Mapping[str, tuple[float, float, float]] = dict.fromkeys(
+    ("sine2", "cosine2", "sine3", "cosine3"), (0.05, -1.0, 1.0)
+)
+
+
+class _Wave(ForceEffect):
+    """A wave with overtones, ``sin a + Σₙ (bₙ sin na + cₙ cos na)`` for n = 2, 3."""
+
+    def __init__(self, phase: float, overtones: tuple[float, float, float, float]) -> None:
+        self.phase = phase
+        self.sine2, self.cosine2, self.sine3, self.cosine3 = overtones
+
+    def _wave(self, angle: Tensor) -> Tensor:
+        wave = (angle + self.phase).sin()
+        for n, b, c in ((2, self.sine2, self.cosine2), (3, self.sine3, self.cosine3)):
+            if b or c:
+                turned = n * (angle + self.phase)
+                wave = wave + b * turned.sin() + c * turned.cos()
+        return wave
+
+
 class ConstantForce(ForceEffect):
     """A constant generalised force ``s``: wind, a hanging cable; up to 30 % of ``F_max``."""
 
@@ -36,23 +57,39 @@ class ConstantForce(ForceEffect):
         return {"force": strength.expand_as(now.velocity)}, memory
 
 
-class PeriodicDisturbance(ForceEffect):
-    """A force that oscillates with time: ``s sin(2π f t + φ)``; up to 30 % of ``F_max``.
+class PeriodicDisturbance(_Wave):
+    """A force that oscillates with time: ``s w(2π f t + φ)``; up to 30 % of ``F_max``.
+
+    ``w`` is a sine, or a wave with the overtones ``w(a) = sin a + Σₙ (bₙ sin na + cₙ cos na)``.
 
     Args:
         frequency: ``f``, Hz.
         phase: ``φ``, rad.
+        sine2: ``b₂``. A diagnosis fits these, with ``f`` and ``φ``.
+        cosine2: ``c₂``.
+        sine3: ``b₃``.
+        cosine3: ``c₃``.
     """
 
     name, unit, group = "periodic_disturbance", "N m", "disturbance"
 
-    def __init__(self, frequency: float = 1.0, phase: float = 0.0) -> None:
-        self.frequency, self.phase = frequency, phase
+    def __init__(
+        self,
+        frequency: float = 1.0,
+        phase: float = 0.0,
+        *,
+        sine2: float = 0.0,
+        cosine2: float = 0.0,
+        sine3: float = 0.0,
+        cosine3: float = 0.0,
+    ) -> None:
+        self.frequency = frequency
+        super().__init__(phase, (sine2, cosine2, sine3, cosine3))
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
-        """Return both."""
+        """Return all of its options."""
         slower = _MOVED / (2 * math.pi * max(reach.time, 1e-9))
-        return {"frequency": (slower, *_ANY), "phase": (_MOVED, *_ANY)}
+        return {"frequency": (slower, *_ANY), "phase": (_MOVED, *_ANY), **_OVERTONES}
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.3 ``F_max``."""
@@ -62,27 +99,43 @@ class PeriodicDisturbance(ForceEffect):
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
         """Return the force at this time."""
-        angle = 2 * math.pi * self.frequency * now.time.to(now.velocity) + self.phase
-        return {"force": strength * angle.sin()}, memory
+        angle = 2 * math.pi * self.frequency * now.time.to(now.velocity)
+        return {"force": strength * self._wave(angle)}, memory
 
 
-class Cogging(ForceEffect):
-    """A force that oscillates with a joint's position: ``s sin(k q + φ)``; up to 15 % of ``F_max``.
+class Cogging(_Wave):
+    """A force that oscillates with a joint's position: ``s w(k q + φ)``; up to 15 % of ``F_max``.
+
+    ``w`` is a sine, or a wave with overtones as of a `PeriodicDisturbance`.
 
     Args:
         number: ``k``, periods per turn of a hinge, or per 2π m of a slide.
         phase: ``φ``, rad.
+        sine2: ``b₂``. A diagnosis fits these, with ``φ`` and a slide's ``k``.
+        cosine2: ``c₂``.
+        sine3: ``b₃``.
+        cosine3: ``c₃``.
     """
 
     name, unit, group = "cogging", "N m", "disturbance"
 
-    def __init__(self, number: float = 6, phase: float = 0.0) -> None:
-        self.number, self.phase = number, phase
+    def __init__(
+        self,
+        number: float = 6,
+        phase: float = 0.0,
+        *,
+        sine2: float = 0.0,
+        cosine2: float = 0.0,
+        sine3: float = 0.0,
+        cosine3: float = 0.0,
+    ) -> None:
+        self.number = number
+        super().__init__(phase, (sine2, cosine2, sine3, cosine3))
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
-        """Return the phase, and a slide's number; a hinge has whole periods per turn."""
+        """Return all but a hinge's number, which has whole periods per turn."""
         wider = {"number": (_MOVED / max(reach.position, 1e-9), *_ANY)} if reach.slides else {}
-        return wider | {"phase": (_MOVED, *_ANY)}
+        return {**wider, "phase": (_MOVED, *_ANY), **_OVERTONES}
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the joints' names."""
@@ -96,4 +149,4 @@ class Cogging(ForceEffect):
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
         """Return the force at this angle."""
-        return {"force": strength * (self.number * now.position + self.phase).sin()}, memory
+        return {"force": strength * self._wave(self.number * now.position)}, memory
