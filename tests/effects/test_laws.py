@@ -341,9 +341,10 @@ def test_only_servos_with_damping_have_a_dead_band_without_it():
         assert [form.on(robot).targets(robot) for form in forms] == some
 
 
-def test_a_servo_of_another_gain_is_what_mujoco_makes_of_it():
-    robot, stiffer = servo('kp="20" kv="2"'), servo('kp="26" kv="2.6"')
-    (law,) = [form.on(robot) for form in effect("action_gain").forms(9.0)[1:]]
+@pytest.mark.parametrize(("form", "kv"), [(1, 2.6), (2, 2.0)])
+def test_a_servo_of_another_gain_is_what_mujoco_makes_of_it(form, kv):
+    robot, stiffer = servo('kp="20" kv="2"'), servo(f'kp="26" kv="{kv}"')
+    law = effect("action_gain").forms(9.0)[form].on(robot)
     added = band(law, robot, target=0.6, qpos=0.5, qvel=1.5, strength=0.3)
     model = stiffer.require_model()
     data = mujoco.MjData(model)

@@ -34,6 +34,7 @@ from .scatter import Scatter
 from .selection import Selection
 from .shrinkage import Shrinkage
 from .verdict import conclude
+from .whole_runs import whole_run_alarm
 
 Array = NDArray[np.float64]
 _TOLD: tuple[str, ...] = "at the prior's mean", "with fitted parameters", "with the effects"
@@ -100,6 +101,8 @@ def assemble(
         ],
         alpha=alpha,
     )
+    if verdict == "none":
+        more += whole_run_alarm(prepared, points["refit"])
     if verdict == "unknown":
         more += late_row_alarms(prepared.sets["train"], selection.nominal.fit)
     if verdict in {"none", "unknown", "not_testable"}:

@@ -37,7 +37,8 @@ class Finding:
     Attributes:
         name: Its name in the catalogue.
         where: Joint, actuator or channel, or ``all``.
-        strength: In ``unit``; where it sits at several targets, their mean.
+        strength: In ``unit``; where it sits at several targets, their mean, or the largest where
+            they are in proportion to their ranges.
         unit: SI unit, or ``fraction``.
         ci95: Interval of the strength.
         p_value: Of the test that nothing was missing, when it was found.

@@ -177,6 +177,10 @@ def _described(effect: Finding) -> str:
         if most - least <= 1e-3 * abs(most):
             each = f"{effect.strength:.3g} ± {half:.2g} {effect.unit}{law}"
             return f"{name} at {len(effect.strengths)} places ({each} each)"
+        largest = max(effect.strengths, key=lambda place: abs(effect.strengths[place]))
+        if effect.where == "all" and effect.strength == effect.strengths[largest]:
+            at = f"{effect.strength:.3g} ± {half:.2g} {effect.unit} at {largest}"
+            return f"{name} at all at once ({at}, elsewhere in proportion to its range{law})"
         sizes = f"{least:.3g} to {most:.3g} {effect.unit}, mean {effect.strength:.3g} ± {half:.2g}"
         return f"{name} at {len(effect.strengths)} places ({sizes}{law})"
     return f"{name} {_place(effect.where)} ({effect.strength:.3g} ± {half:.2g} {effect.unit}{law})"

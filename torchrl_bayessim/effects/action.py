@@ -230,21 +230,22 @@ class ActionGain(ActionEffect):
     Args:
         bend: ``b``; 0 where large commands are as wrong as small ones. A diagnosis fits it.
         servo: Of servos: whether it is their force that is scaled.
+        damped: Of these: whether their damping is, too.
     """
 
     name, unit, group, memoryless = "action_gain", "fraction", "gain", True
 
-    def __init__(self, bend: float = 0.0, *, servo: bool = False) -> None:
-        self.bend, self.servo = bend, servo
+    def __init__(self, bend: float = 0.0, *, servo: bool = False, damped: bool = True) -> None:
+        self.bend, self.servo, self.damped = bend, servo, damped
 
     def forms(self, seconds: float) -> tuple[Effect, ...]:
         """Return the factor on commands, and that on the force of servos."""
         del seconds
-        return ActionGain(), ActionGain(servo=True)
+        return ActionGain(), ActionGain(servo=True), ActionGain(servo=True, damped=False)
 
     def on(self, robot: Robot) -> Effect:
         """Return the gain of servos, where it is that."""
-        return ServoGain() if self.servo and servos(robot) else self
+        return ServoGain(damped=self.damped) if self.servo and servos(robot) else self
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the actuators' names, none if it is of servos only."""

@@ -118,22 +118,25 @@ class TorqueSpeedLimit(_Transmission):
 
 
 class ServoGain(_Transmission):
-    """A servo is stiffer or softer than told, its damping too: its force is ``(1 + s) F``.
+    """A servo is stiffer or softer than told: its force is ``(1 + s) F``.
 
     A fraction, −0.5 to 0.5. In the logs it is as if all that the servo moves were lighter.
 
     Args:
         servo: Always; what tells it from a factor on the target, `ActionGain`.
+        damped: Whether its damping changes with it. Otherwise ``F`` is the spring's force alone;
+            only servos with damping have that.
     """
 
     name, unit, group = "action_gain", "fraction", "gain"
 
-    def __init__(self, *, servo: bool = True) -> None:
-        self.servo = servo
+    def __init__(self, *, servo: bool = True, damped: bool = True) -> None:
+        self.servo, self.damped = servo, damped
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the actuators' names, none if no servo is among them."""
-        return super().targets(robot) if servos(robot) else ()
+        able = servos(robot) and (self.damped or bool(servo_damping(robot).any()))
+        return super().targets(robot) if able else ()
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return −0.5 and 0.5, and nothing for motors."""
@@ -145,7 +148,10 @@ class ServoGain(_Transmission):
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
         """Return the change of commands."""
-        return {"command": strength * now.actuator_force / now.actuator_gain}, memory
+        force = now.actuator_force
+        if not self.damped:
+            force = force - servo_damping(now.robot).to(force) * now.actuator_velocity
+        return {"command": strength * force / now.actuator_gain}, memory
 
 
 class ServoDeadBand(_Transmission):
