@@ -216,7 +216,7 @@ def test_the_frequency_of_a_disturbance_is_found():
     assert effect.frequency == pytest.approx(1.7, abs=0.1)
     assert f"N m, {effect.frequency:.3g} Hz)" in report.summary
     told = json.loads(report.as_json())
-    assert told["effects"][0]["form"] == {"frequency": effect.frequency, "phase": effect.phase}
+    assert told["effects"][0]["form"] == effect.form
     (named,) = (c for c in told["candidates"] if c["status"] == "named")
     assert named["form"] == told["effects"][0]["form"]
     assert {k: v for k, v in told["candidates"][-1].items() if k == "form"} == {"form": {}}

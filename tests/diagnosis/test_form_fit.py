@@ -37,7 +37,7 @@ def test_magnets_along_a_rail_are_found_with_their_distance_and_phase_and_nothin
     assert report.gap.with_effects < 1.3
 
 
-@pytest.mark.parametrize(("hardening", "within"), [(5.0, 0.1), (0.0, None)])
+@pytest.mark.parametrize(("hardening", "within"), [(12.0, 0.1), (0.0, None)])
 def test_a_spring_is_found_with_how_it_hardens_and_nothing_beside_it(hardening, within):
     report = diagnosed(lambda t, q: -2.0 * q * (1 + hardening * q**2), 3)
     assert [effect.name for effect in report.effects] == ["parallel_spring"]

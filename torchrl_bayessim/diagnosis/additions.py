@@ -5,12 +5,13 @@ All from the correlations of a screen, without a simulation.
 
 from __future__ import annotations
 
-__all__ = ["groups", "pairs", "singles"]
+__all__ = ["groups", "one_for_all", "pairs", "singles"]
 
 import numpy as np
 from scipy.optimize import nnls
 
 from ..effects.effect import Effect
+from ..effects.transmission import ServoGain
 from .objective import Unit
 from .screening import Screen
 
@@ -64,13 +65,16 @@ def pairs(seen: Screen) -> list[dict[Unit, float]]:
 
 
 def groups(seen: Screen) -> list[dict[Unit, float]]:
-    """Return each effect at several of its targets, strengths of their own by non-negative fits."""
+    """Return each effect at several of its targets, strengths of their own by non-negative fits.
+
+    Gains of servos are one at all or at single ones: of either sign at each, they imitate friction.
+    """
     found = []
     usable = (seen.norms > 0) & (seen.growth == seen.growth.min(initial=np.inf))
     for name in dict.fromkeys(unit.name for unit in seen.units):
         best: dict[str, int] = {}  # by target: one law of the name at each
         for i, unit in enumerate(seen.units):
-            if unit.name == name and unit.where != "all" and usable[i]:
+            if unit.name == name and unit.where != "all" and usable[i] and not one_for_all(unit):
                 known = best.setdefault(unit.where, i)
                 best[unit.where] = i if seen.scores[i] > seen.scores[known] else known
         if len(best) < 2:
@@ -89,3 +93,8 @@ def groups(seen: Screen) -> list[dict[Unit, float]]:
             found.append((float(amplitude @ scores) - 4 * len(on), on))
     found.sort(key=lambda pair: -pair[0])
     return [on for _, on in found[:_GROUPS]]
+
+
+def one_for_all(unit: Unit) -> bool:
+    """Return whether an effect has no strength of its own at each of several targets."""
+    return isinstance(unit.effect, ServoGain)

@@ -33,7 +33,13 @@ def candidates(
     strongest: dict[Unit, tuple[float, float]] = {}
     for unit, value in seen.best(1.0).items():  # the strongest first
         strongest.setdefault(same[unit], value)
-    detectable = {same[unit]: value for unit, value in seen.detectable(alpha).items()}
+    # what is ruled out is ruled out in every form
+    hardest: dict[str, tuple[float, Unit]] = {}
+    for unit, value in seen.detectable(alpha).items():
+        known, form = hardest.get(str(unit), (0.0, unit))
+        if unit.actual(value) >= form.actual(known):
+            hardest[str(unit)] = value, unit
+    detectable = {unit: hardest[str(unit)] for unit in same.values()}
     fitted = {m.units[0]: m for m in selection.tried if len(m.units) == 1}
     excess = max(seen.residual - seen.effective, 1e-9)
     units = [same[unit] for unit in seen.units]
@@ -59,7 +65,7 @@ def candidates(
             gain = before - float((model.validation**2).sum())
             # a bent fit hides from its derivatives what a fit of the effect then shows
             ratio = max(ratio, selection.nominal.fit.misfit - model.fit.misfit)  # noqa: PLW2901
-        least = detectable[unit]
+        least, hidden = detectable[unit]
         result.append(
             Candidate(
                 name=unit.name,
@@ -71,7 +77,7 @@ def candidates(
                 held_out_gain=gain,
                 explained_fraction=float(np.clip(ratio * growth[unit] / excess, 0.0, 1.0)),
                 explained_by_parameters=swallowed[unit],
-                minimal_detectable_strength=unit.actual(least) if np.isfinite(least) else None,
+                minimal_detectable_strength=hidden.actual(least) if np.isfinite(least) else None,
                 form=unit.effect.form,
                 unit=unit.measured_in(robot),
                 status=_status(

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..effects.effect import Effect
 from ..effects.robot import Robot
-from .additions import groups, pairs, singles
+from .additions import groups, one_for_all, pairs, singles
 from .objective import Objective, Point, Unit, units_of
 from .refit import Fit, refit
 from .screening import Screen, screen
@@ -153,7 +153,7 @@ def _spread(fit: Fit, robot: Robot) -> list[Point]:
     strengths: dict[Unit, float] = {}
     for unit, strength in fit.point.strengths.items():
         parts = [unit]
-        if sum(part != 0 for part in unit.direction) > 1:
+        if sum(part != 0 for part in unit.direction) > 1 and not one_for_all(unit):
             parts = [one for one in units_of([unit.effect], robot) if one.where != "all"]
         for part in parts:
             share = float(np.dot(part.direction, unit.direction)) if part != unit else 1.0

@@ -16,13 +16,13 @@ import numpy as np
 
 from ..effects.effect import Reach
 from ..effects.units import slides
-from .model import LIKELY, Model, judged
+from .model import LIKELY, Model, judged, price
 from .objective import Objective, Point, Unit
 from .refit import refit, with_prior
 
 _STEPS = 4  # of Gauss and Newton
+_WHITE, _WHITER = 1.2, 4.0  # mean squared innovation of a model that leaves noise alone
 _FARTHEST = 10.0  # times the change that shows, in one step: laws are not linear in these numbers
-_MORE = 2.0  # deviance that a further number gains by chance
 
 
 @dataclass(frozen=True)
@@ -35,25 +35,50 @@ class _Shift:
     least: float
     most: float
 
+    @property
+    def bends(self) -> bool:
+        """Whether it bends a law, rather than places a wave."""
+        return bool(np.isfinite(self.least))
+
 
 def with_fitted_forms(train: Objective, validation: Objective, model: Model) -> Model:
     """Return the model with what its effects have free beside their strengths fitted, too.
 
     What is free (`Effect.free`: the frequency of a periodic force, how a spring hardens) moves the
     innovations linearly where it changes little, and is solved for together with parameters and
-    strengths. The model itself comes back where nothing is gained that chance would not often give.
+    strengths. The model itself comes back where nothing is gained that chance would not often give:
+    what bends a law is priced like strengths, several where the law leaves noise alone anyway; what
+    was read off a grid has been paid for.
     """
-    best = model
-    needed = LIKELY + _MORE * (len(_shifts(train, model)) - 1)
+    placed = _fitted((train, validation), model, bends=False)
+    count = sum(shift.bends for shift in _shifts(train, placed))
+    if not count:
+        return placed
+    needed = price(placed) * (_WHITER if placed.mean_square < _WHITE else 1.0)
+    return _fitted((train, validation), placed, bends=True, needed=LIKELY + count * needed)
+
+
+def _fitted(
+    sets: tuple[Objective, Objective], model: Model, *, bends: bool, needed: float = LIKELY
+) -> Model:
+    """Return the model with what is free fitted, or itself where that gains too little.
+
+    Args:
+        sets: Where models are fitted, and judged.
+        model: To start from.
+        bends: Whether what bends a law is fitted too.
+        needed: Deviance to gain.
+    """
+    train, best = sets[0], model
     for _ in range(_STEPS):
-        shifts = _shifts(train, best)
+        shifts = [shift for shift in _shifts(train, best) if bends or not shift.bends]
         if not shifts:
             return model
         fitted = refit(train, [_moved(train, best, shifts)], iterations=2)[0]
         gained = best.fit.cost - fitted.cost
         if gained <= 0:
             break
-        best = judged(train, validation, [fitted])[0]
+        (best,) = judged(*sets, [fitted])
         if gained < LIKELY:
             break
     return best if model.fit.cost - best.fit.cost > needed else model

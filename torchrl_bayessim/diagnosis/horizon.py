@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..effects.effect import Effect
 from ..logs.log import Log
 from .objective import Objective, Point, Unit, origin, parameters_at
 from .prediction import Predictor
@@ -41,7 +42,10 @@ def chosen_horizon(
     """
     prior = predictor.system.prior
     z = origin(prior)
-    units = list({unit.name: unit for unit in units}.values())
+    usual: dict[str, Effect] = {}  # of its forms the first
+    for unit in units:
+        usual.setdefault(unit.name, unit.effect)
+    units = list({u.name: u for u in units if u.effect == usual[u.name]}.values())
     typical = float(np.median([len(log) for log in logs]))
     guessed = any(log.uncertainty is not None for log in logs)
     filtered = any(log.touching is not None for log in logs)

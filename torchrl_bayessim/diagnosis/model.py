@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["LIKELY", "Model", "as_good", "criterion", "gain", "judged", "needed"]
+__all__ = ["LIKELY", "Model", "as_good", "criterion", "gain", "judged", "needed", "price"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -65,7 +65,12 @@ def judged(train: Objective, validation: Objective, fits: Sequence[Fit]) -> list
 def criterion(model: Model, dispersion: float) -> float:
     """Return the deviance of all segments plus a price per strength; smaller is better."""
     total = float(model.deviances().sum())
-    return total / dispersion + len(model.units) * np.log(model.deviances().size * 8)
+    return total / dispersion + len(model.units) * price(model)
+
+
+def price(model: Model) -> float:
+    """Return the deviance that a further number has to explain."""
+    return float(np.log(model.deviances().size * 8))
 
 
 def gain(base: Model, model: Model) -> float:
