@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.logs.read import read_logs
 from torchrl_bayessim.logs.system import System
@@ -179,7 +180,7 @@ def test_a_named_effect_is_simulated_as_its_report_has_it(tmp_path, plain):
     found = {"name": "cogging", "where": "hinge", "strengths": {"hinge": 0.1}}
     report = {"effects": [found], "options": {"cogging": {"number": 12, "phase": 0.5}}}
     ((unit, strength),) = _named(system, report, logs).items()
-    assert vars(unit.effect) == {"number": 12, "phase": 0.5}
+    assert unit.effect == effect("cogging", number=12, phase=0.5)
     assert strength == 0.1
     lost = {"name": "packet_drop", "where": "motor", "strengths": {"motor": 0.1}}
     assert _named(system, {"effects": [lost]}, logs) == {}
