@@ -12,7 +12,7 @@ from test_diagnose import ARM, BOUNDS, SOME, logs, system
 from torchrl_bayessim.diagnosis.credit import unit_credit
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.divergence import diverges_throughout
-from torchrl_bayessim.diagnosis.doubts import doubts, numerical
+from torchrl_bayessim.diagnosis.doubts import alike, doubts, numerical
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.report import Finding
 from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
@@ -172,3 +172,31 @@ def test_an_armature_that_an_integrator_adds_is_no_cause(name, strength, damping
     )
     alarms = numerical([found], robot)
     assert any("no more than another integrator adds" in alarm for alarm in alarms) == artefact
+
+
+@pytest.mark.parametrize(
+    ("names", "doubted"),
+    [
+        (("payload", "armature"), True),
+        (("payload", "constant_force"), False),
+        (("coulomb_friction", "viscous_friction"), False),  # the usual model
+        (("payload",), False),
+    ],
+)
+def test_two_causes_that_act_alike_at_one_joint_are_doubted(names, doubted):
+    robot = robot_of(Task(model=mujoco.MjModel.from_xml_string(ARM), frame_skip=5))
+    units = [u for u in units_of([catalogued(n) for n in names], robot) if u.where != "all"]
+    assert bool(alike(units, robot)) == doubted
+    if doubted:
+        assert "payload and armature at hinge act alike: they may stand" in alike(units, robot)[0]
+
+
+def test_a_tilt_along_a_joints_axis_has_no_sign():
+    """Of which only the cosine matters: all that gravity is weaker."""
+    weaker = ARM.replace("<option", '<option gravity="0 0 -9.4"')
+    report = diagnose(system(), None, logs(xml=weaker), effects=["gravity_tilt"])
+    assert report.verdict == "named_partial"
+    (found,) = report.effects
+    assert abs(found.strength) == pytest.approx(np.arccos(9.4 / 9.81), rel=0.05)
+    said = f"gravity tilt at x is {abs(found.strength):.3g} or {-abs(found.strength):.3g} rad"
+    assert any(said in alarm and "not tell its sign" in alarm for alarm in report.alarms)

@@ -1,10 +1,14 @@
 """What a law has beside its strength is fitted once the effect is in the model."""
 
+import mujoco
 import numpy as np
 import pytest
 from rail_cart import cart, ride
+from test_diagnose import ARM, logs
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.envs.task import Task
+from torchrl_bayessim.logs.system import System
 
 SOME = (
     "cogging", "coulomb_friction", "parallel_spring", "periodic_disturbance", "sensor_drift",
@@ -46,3 +50,15 @@ def test_a_spring_is_found_with_how_it_hardens_and_nothing_beside_it(hardening, 
     expected = 0.0 if within is None else pytest.approx(hardening, rel=within)
     assert found.hardening == expected
     assert report.gap.with_effects < 1.1
+
+
+def test_one_gain_that_bends_is_named_and_not_two_effects_that_imitate_it():
+    weaker = logs(act=lambda u, k: u[k] * (1 + 0.3 * (1 - 0.5 * abs(u[k]) / 4)))
+    some = ["action_gain", "saturation", "dead_band", "quadratic_drag"]
+    known = ARM.replace('mass=".6"', 'mass=".66"').replace('damping=".05"', 'damping=".08"')
+    task = Task(model=mujoco.MjModel.from_xml_string(known), frame_skip=5)
+    report = diagnose(System(task=task), None, weaker, effects=some)
+    assert [effect.name for effect in report.effects] == ["action_gain"]
+    assert report.effects[0].strength == pytest.approx(0.3, rel=0.1)
+    (found,) = report.strengths
+    assert found.bend == pytest.approx(-0.5, abs=0.1)

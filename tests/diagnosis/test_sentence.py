@@ -2,8 +2,12 @@
 
 import pytest
 
-from torchrl_bayessim.diagnosis.report import Candidate
-from torchrl_bayessim.diagnosis.sentence import _ruled_out
+from torchrl_bayessim.diagnosis.found import _at_targets
+from torchrl_bayessim.diagnosis.objective import Unit
+from torchrl_bayessim.diagnosis.report import Candidate, Finding
+from torchrl_bayessim.diagnosis.sentence import _described, _ruled_out
+from torchrl_bayessim.effects.catalogue import effect
+from torchrl_bayessim.effects.robot import Robot
 
 
 def candidate(where, least, *, name="coulomb_friction", status="ruled_out", form=None):
@@ -43,3 +47,41 @@ def test_the_least_strength_is_that_of_the_place(candidates, said):
 def test_a_force_that_comes_again_is_ruled_out_at_its_frequency_only():
     one = candidate("hinge", 0.1, name="periodic_disturbance", form={"frequency": 1.0})
     assert _ruled_out([one]) == (" Ruled out: periodic disturbance, 1 Hz above 0.1 N m at hinge.")
+
+
+def finding(name, strengths, *, where, strength, form=None, unit="rad/s"):
+    return Finding(
+        name=name,
+        where=where,
+        strength=strength,
+        unit=unit,
+        ci95=(strength - 0.01, strength + 0.01),
+        p_value=0.0,
+        share_of_gap=1.0,
+        strengths=strengths,
+        form=form or {},
+    )
+
+
+def test_what_acts_at_all_in_proportion_is_said_with_the_place_of_its_strength():
+    robot = Robot(dt=0.01, channels=("q", "v"))
+    unit = Unit(effect("sensor_bias"), "all", (0.25, 1.0), -1.0, 1.0)
+    strengths = _at_targets({unit: -0.024}, robot)
+    assert strengths == {"q": pytest.approx(-0.006), "v": -0.024}
+    said = _described(finding("sensor_bias", strengths, where="all", strength=-0.024))
+    at_all = "sensor bias at all at once (-0.024 ± 0.01 rad/s at v, elsewhere in proportion"
+    assert said.startswith(at_all)
+
+
+@pytest.mark.parametrize(
+    ("form", "said"),
+    [
+        ({"hardening": 5.0}, "(2 ± 0.01 N m/rad, hardening by 5 x²)"),
+        ({"hardening": 0.0}, "(2 ± 0.01 N m/rad)"),
+    ],
+)
+def test_a_law_that_bends_is_said_to(form, said):
+    one = finding(
+        "parallel_spring", {"hinge": 2.0}, where="hinge", strength=2.0, form=form, unit="N m/rad"
+    )
+    assert _described(one) == f"parallel spring at hinge {said}"

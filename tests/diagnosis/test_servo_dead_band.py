@@ -46,3 +46,19 @@ def test_the_dead_band_of_a_servo_is_told_from_friction(damped, held):
     # held and with damping it is a band that acts late, of which half is found
     assert found.strength == pytest.approx(BAND, rel=0.6 if held and damped else 0.1)
     assert report.gap.explained_fraction > 0.8
+
+
+def test_a_softer_servo_is_told_from_friction_and_mass():
+    """Its damping is what it was: if that were less too, it were all the rest that is heavier."""
+    softer = SERVO.replace(f'kp="{KP}"', f'kp="{0.8 * KP}"')
+
+    def act(u, k):
+        u[k] *= 0.4
+        return u[k]
+
+    some = ["action_gain", "viscous_friction", "payload", "armature"]
+    report = diagnose(system(SERVO), None, logs(act=act, xml=softer), effects=some)
+    (found,) = report.effects
+    assert found.name == "action_gain"
+    assert found.form == {"servo": True, "damped": False}
+    assert found.strength == pytest.approx(-0.2, abs=0.02)
