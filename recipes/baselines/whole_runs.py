@@ -62,8 +62,10 @@ def whole_runs(
             what is told, or what differences say.
     """
     predictor = Predictor(system, threads=1)
-    parts, sd = split(logs), assumed_noise(predictor, logs)
-    if noise is not None:
+    parts = split(logs)
+    if noise is None:
+        sd = assumed_noise(predictor, logs)
+    else:
         sd = np.array([noise[channel] for channel in system.robot.channels])
     steps = min(len(log) for log in logs) - 1
     history = round(_HISTORY / system.control_dt)

@@ -70,20 +70,18 @@ def unsigned(best: Model, prepared: Prepared) -> list[str]:
 
     Of a tilt along a joint's axis, only its cosine matters.
     """
-    point, found = best.fit.point, []
+    point, robot = best.fit.point, prepared.predictor.system.robot
     signed = [unit for unit in best.units if unit.low < 0 and point.strengths[unit]]
-    for unit in signed:
-        other = Point(point.z, {**point.strengths, unit: -point.strengths[unit]})
-        fit = refit(prepared.sets["train"], [other], iterations=0)
-        (mirrored,) = judged(prepared.sets["train"], prepared.sets["validation"], fit)
-        if as_good(best, mirrored):
-            size = abs(unit.actual(point.strengths[unit]))
-            unit_of = unit.measured_in(prepared.predictor.system.robot)
-            found.append(
-                f"{plain(unit.name)} at {unit.where} is {size:.3g} or {-size:.3g} {unit_of}: "
-                "these data do not tell its sign"
-            )
-    return found
+    others = [Point(point.z, {**point.strengths, u: -point.strengths[u]}) for u in signed]
+    train, validation = prepared.sets["train"], prepared.sets["validation"]
+    mirrored = judged(train, validation, refit(train, others, iterations=0))
+    sizes = [abs(unit.actual(point.strengths[unit])) for unit in signed]
+    return [
+        f"{plain(unit.name)} at {unit.where} is {size:.3g} or {-size:.3g} "
+        f"{unit.measured_in(robot)}: these data do not tell its sign"
+        for unit, size, model in zip(signed, sizes, mirrored, strict=True)
+        if as_good(best, model)
+    ]
 
 
 def baseless(effects: Sequence[Finding], units: Sequence[Unit]) -> bool:

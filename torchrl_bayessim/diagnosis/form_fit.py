@@ -16,12 +16,12 @@ import numpy as np
 
 from ..effects.effect import Reach
 from ..effects.units import slides
-from .model import LIKELY, Model, judged, price
+from .model import LIKELY, WHITE, Model, judged, price
 from .objective import Objective, Point, Unit
 from .refit import refit, with_prior
 
 _STEPS = 4  # of Gauss and Newton
-_WHITE, _WHITER = 1.2, 4.0  # mean squared innovation of a model that leaves noise alone
+_WHITER = 4.0  # times the price of a number, where a model leaves noise alone
 _FARTHEST = 10.0  # times the change that shows, in one step: laws are not linear in these numbers
 
 
@@ -54,7 +54,7 @@ def with_fitted_forms(train: Objective, validation: Objective, model: Model) -> 
     count = sum(shift.bends for shift in _shifts(train, placed))
     if not count:
         return placed
-    needed = price(placed) * (_WHITER if placed.mean_square < _WHITE else 1.0)
+    needed = price(placed) * (_WHITER if placed.mean_square < WHITE else 1.0)
     return _fitted((train, validation), placed, bends=True, needed=LIKELY + count * needed)
 
 

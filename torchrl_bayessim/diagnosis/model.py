@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["LIKELY", "Model", "as_good", "criterion", "gain", "judged", "needed", "price"]
+__all__ = ["LIKELY", "WHITE", "Model", "as_good", "criterion", "gain", "judged", "needed", "price"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 LIKELY = 6.0  # a deviance that chance often makes
 _CHANCE = 0.01  # of a test that two models explain the data equally well
 _WORSE = 1.5  # times the misfit of the best model: too much for an equal, however few the data
-_WHITE = 1.2  # mean squared innovation of a model that leaves noise alone
+WHITE = 1.2  # mean squared innovation of a model that leaves noise alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ def as_good(best: Model, rival: Model) -> bool:
     mine, others = best.deviances(), rival.deviances()
     if float((others - mine).sum()) / best.dispersion() < LIKELY:
         return True
-    if best.mean_square < _WHITE:
+    if best.mean_square < WHITE:
         return False
     if float(others.sum()) > _WORSE * float(mine.sum()):
         return False

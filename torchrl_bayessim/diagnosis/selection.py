@@ -99,8 +99,8 @@ def select(
         progress("fitting explanations")
         models = judged(train, validation, explanations(train, now))
         tried += models
-        better = _needed_only(best, _chosen(best, models), models, worth=worth)
-        better = _one_of_another_form((train, validation), best, better, models)
+        better = _chosen(best, models)
+        better = _fewest((train, validation), best, better, models, worth=worth)
         if better is None or not worth(best, better, models):
             break
         best = with_fitted_forms(train, validation, _exactly(train, validation, better))
@@ -208,32 +208,32 @@ def _coarser(model: Model, models: Sequence[Model]) -> list[Model]:
     ]
 
 
-def _needed_only(
-    base: Model, better: Model | None, models: Sequence[Model], *, worth: Callable[..., bool]
+def _fewest(
+    sets: tuple[Objective, Objective],
+    base: Model,
+    better: Model | None,
+    models: Sequence[Model],
+    *,
+    worth: Callable[..., bool],
 ) -> Model | None:
-    """Return the best model, or the one with a single new effect if more are a stopgap."""
-    if better is None or len({u.name for u in better.units if u not in base.units}) < 2:
-        return better
-    single = [m for m in models if len({u.name for u in m.units if u not in base.units}) == 1]
-    smaller = _chosen(base, single)
-    if smaller is None or worth(smaller, better, models):
-        return better
-    return smaller
+    """Return the best model, or one with a single new effect where more are a stopgap.
 
-
-def _one_of_another_form(
-    sets: tuple[Objective, Objective], base: Model, better: Model | None, models: Sequence[Model]
-) -> Model | None:
-    """Return a single effect in a fitted form, where several explain no more than that."""
-    added = {u.name for u in better.units if u not in base.units} if better is not None else set()
-    if better is None or len(added) < 2:
+    Or where that effect explains as much in another form, which the others imitate.
+    """
+    if better is None or len(_new_names(base, better)) < 2:
         return better
-    single = [m for m in models if len({u.name for u in m.units if u not in base.units}) == 1]
-    smaller = _chosen(base, single)
+    smaller = _chosen(base, [m for m in models if len(_new_names(base, m)) == 1])
     if smaller is None:
         return better
+    if not worth(smaller, better, models):
+        return smaller
     fitted = with_fitted_forms(*sets, smaller)
     return fitted if fitted is not smaller and as_good(better, fitted) else better
+
+
+def _new_names(base: Model, model: Model) -> set[str]:
+    """Return the effects that a model has beside those of its base."""
+    return {unit.name for unit in model.units if unit not in base.units}
 
 
 def _eliminated(train: Objective, validation: Objective, model: Model) -> tuple[Model, list[Model]]:

@@ -18,8 +18,6 @@ from .robot import Robot
 
 _MOVED = 0.05  # rad by which an angle is moved to see what that does, at its farthest
 _ANY = -math.inf, math.inf
-
-
 _OVERTONES: Mapping[str, tuple[float, float, float]] = dict.fromkeys(
     ("sine2", "cosine2", "sine3", "cosine3"), (0.05, -1.0, 1.0)
 )
@@ -28,9 +26,18 @@ _OVERTONES: Mapping[str, tuple[float, float, float]] = dict.fromkeys(
 class _Wave(ForceEffect):
     """A wave with overtones, ``sin a + Σₙ (bₙ sin na + cₙ cos na)`` for n = 2, 3."""
 
-    def __init__(self, phase: float, overtones: tuple[float, float, float, float]) -> None:
+    def __init__(
+        self,
+        phase: float,
+        *,
+        sine2: float = 0.0,
+        cosine2: float = 0.0,
+        sine3: float = 0.0,
+        cosine3: float = 0.0,
+    ) -> None:
         self.phase = phase
-        self.sine2, self.cosine2, self.sine3, self.cosine3 = overtones
+        self.sine2, self.cosine2 = sine2, cosine2
+        self.sine3, self.cosine3 = sine3, cosine3
 
     def _wave(self, angle: Tensor) -> Tensor:
         wave = (angle + self.phase).sin()
@@ -73,18 +80,9 @@ class PeriodicDisturbance(_Wave):
 
     name, unit, group = "periodic_disturbance", "N m", "disturbance"
 
-    def __init__(
-        self,
-        frequency: float = 1.0,
-        phase: float = 0.0,
-        *,
-        sine2: float = 0.0,
-        cosine2: float = 0.0,
-        sine3: float = 0.0,
-        cosine3: float = 0.0,
-    ) -> None:
+    def __init__(self, frequency: float = 1.0, phase: float = 0.0, **overtones: float) -> None:
         self.frequency = frequency
-        super().__init__(phase, (sine2, cosine2, sine3, cosine3))
+        super().__init__(phase, **overtones)
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
         """Return all of its options."""
@@ -119,18 +117,9 @@ class Cogging(_Wave):
 
     name, unit, group = "cogging", "N m", "disturbance"
 
-    def __init__(
-        self,
-        number: float = 6,
-        phase: float = 0.0,
-        *,
-        sine2: float = 0.0,
-        cosine2: float = 0.0,
-        sine3: float = 0.0,
-        cosine3: float = 0.0,
-    ) -> None:
+    def __init__(self, number: float = 6, phase: float = 0.0, **overtones: float) -> None:
         self.number = number
-        super().__init__(phase, (sine2, cosine2, sine3, cosine3))
+        super().__init__(phase, **overtones)
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
         """Return all but a hinge's number, which has whole periods per turn."""

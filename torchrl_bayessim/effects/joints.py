@@ -19,7 +19,7 @@ from .laws import within
 from .robot import Robot
 
 # MuJoCo's damping in proportion to speed, and stiffness in proportion to the angle's square
-_BY_SPEED, _BY_SQUARE = ("dof_dampingpoly", 0), ("jnt_stiffnesspoly", 1)
+_BY_SPEED, _BY_SQUARE = ("dof_dampingpoly", (0,)), ("jnt_stiffnesspoly", (1,))
 _STEP = 0.05  # of a force at the farthest, to see what a change of the law does
 
 
@@ -37,9 +37,7 @@ class _Joint(ModelEffect):
 
     def write(self, fields: Fields, strength: Tensor, robot: Robot) -> None:
         """Add to the joints' entries."""
-        for j, index in enumerate(self._indices(robot)):
-            entry = self.field, (index,)
-            fields[entry] = fields[entry] + strength[..., j]
+        _add(fields, (self.field, ()), self._indices(robot), strength)
 
     def _indices(self, robot: Robot) -> tuple[int, ...]:
         return robot.dof_index
@@ -125,9 +123,11 @@ class Armature(_Joint):
         return within(torch.from_numpy(inertia), 0.0, 1.0)
 
 
-def _add(fields: Fields, column: tuple[str, int], indices: tuple[int, ...], values: Tensor) -> None:
-    """Add values ``(*batch, J)`` to a column of a field."""
-    name, number = column
+def _add(
+    fields: Fields, column: tuple[str, tuple[int, ...]], indices: tuple[int, ...], values: Tensor
+) -> None:
+    """Add values ``(*batch, J)`` to a field, or to a column of it."""
+    name, rest = column
     for j, index in enumerate(indices):
-        entry = name, (index, number)
+        entry = name, (index, *rest)
         fields[entry] = fields[entry] + values[..., j]

@@ -117,7 +117,25 @@ class TorqueSpeedLimit(_Transmission):
         return _change(torch.where(drives, limited, now.actuator_force), now), memory
 
 
-class ServoGain(_Transmission):
+class _OfServos(_Transmission):
+    """What acts on the force of servos, with the part that is their damping or without it."""
+
+    damped: bool
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the actuators' names, none if the force of one is not known."""
+        names = super().targets(robot)
+        return names if self.damped or (names and bool(servo_damping(robot).any())) else ()
+
+    def _error(self, now: Now) -> Tensor:
+        """Return the force per unit of command: of a servo the distance from its target."""
+        force = now.actuator_force
+        if not self.damped:
+            force = force - servo_damping(now.robot).to(force) * now.actuator_velocity
+        return force / now.actuator_gain
+
+
+class ServoGain(_OfServos):
     """A servo is stiffer or softer than told: its force is ``(1 + s) F``.
 
     A fraction, −0.5 to 0.5. In the logs it is as if all that the servo moves were lighter.
@@ -135,8 +153,7 @@ class ServoGain(_Transmission):
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the actuators' names, none if no servo is among them."""
-        able = servos(robot) and (self.damped or bool(servo_damping(robot).any()))
-        return super().targets(robot) if able else ()
+        return super().targets(robot) if servos(robot) else ()
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return −0.5 and 0.5, and nothing for motors."""
@@ -148,13 +165,10 @@ class ServoGain(_Transmission):
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
         """Return the change of commands."""
-        force = now.actuator_force
-        if not self.damped:
-            force = force - servo_damping(now.robot).to(force) * now.actuator_velocity
-        return {"command": strength * force / now.actuator_gain}, memory
+        return {"command": strength * self._error(now)}, memory
 
 
-class ServoDeadBand(_Transmission):
+class ServoDeadBand(_OfServos):
     """A servo does nothing within ``s`` of its target, and elsewhere acts as if that much nearer.
 
     ``e' = sgn(e) max(|e| − s, 0)`` for the error ``e = F / g``, the force per unit of command: of a
@@ -171,11 +185,6 @@ class ServoDeadBand(_Transmission):
     def __init__(self, *, damped: bool = True) -> None:
         self.damped = damped
 
-    def targets(self, robot: Robot) -> tuple[str, ...]:
-        """Return the actuators' names, none if the force of one is not known."""
-        names = super().targets(robot)
-        return names if self.damped or (names and bool(servo_damping(robot).any())) else ()
-
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and a tenth of a unit or of ``u_max``."""
         wide = 0.1 * robot.command_scale.clamp(max=1.0)
@@ -185,11 +194,7 @@ class ServoDeadBand(_Transmission):
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
         """Return the change of commands."""
-        force = now.actuator_force
-        if not self.damped:
-            force = force - servo_damping(now.robot).to(force) * now.actuator_velocity
-        error = force / now.actuator_gain
-        return {"command": -error.clamp(-strength, strength)}, memory
+        return {"command": -self._error(now).clamp(-strength, strength)}, memory
 
 
 def servo_damping(robot: Robot) -> Tensor:
