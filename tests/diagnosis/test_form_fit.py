@@ -52,6 +52,32 @@ def test_a_spring_is_found_with_how_it_hardens_and_nothing_beside_it(hardening, 
     assert report.gap.with_effects < 1.1
 
 
+def test_a_spring_and_a_shaking_force_are_found_though_magnets_imitated_the_spring_at_first():
+    """Seed 2: the search takes cogging first, which a spring that hardens replaces at the end."""
+    stiffness, hardening, strength = 1.588, 7.62, 0.263
+    report = diagnosed(
+        lambda t, q: -stiffness * q * (1 + hardening * q**2)
+        - strength * np.cos(2 * np.pi * FREQUENCY * t + 0.5),
+        2,
+    )
+    names = [effect.name for effect in report.effects]
+    assert names == ["parallel_spring", "periodic_disturbance"]
+    spring = next(law for law in report.strengths if law.name == "parallel_spring")
+    assert spring.hardening == pytest.approx(hardening, rel=0.1)
+    for effect, true in zip(report.effects, (stiffness, strength), strict=True):
+        assert effect.ci95[0] < true < effect.ci95[1]
+
+
+def test_a_form_is_fitted_again_once_a_second_cause_is_in_the_model():
+    """Seed 0: alone the spring seems to harden by 7."""
+    report = diagnosed(
+        lambda t, q: -1.551 * q * (1 + 11.37 * q**2) - 0.108 * np.cos(2 * np.pi * FREQUENCY * t),
+        0,
+    )
+    spring = next(law for law in report.strengths if law.name == "parallel_spring")
+    assert spring.hardening == pytest.approx(11.37, rel=0.1)
+
+
 def test_one_gain_that_bends_is_named_and_not_two_effects_that_imitate_it():
     weaker = logs(act=lambda u, k: u[k] * (1 + 0.3 * (1 - 0.5 * abs(u[k]) / 4)))
     some = ["action_gain", "saturation", "dead_band", "quadratic_drag"]

@@ -8,8 +8,9 @@ from plain_models import A, B, C, Unit, plain
 
 from torchrl_bayessim.diagnosis.alternatives import exchanged
 from torchrl_bayessim.diagnosis.credit import worthwhile
+from torchrl_bayessim.diagnosis.elimination import _idle_place
 from torchrl_bayessim.diagnosis.model import Model
-from torchrl_bayessim.diagnosis.selection import Selection, _idle_place
+from torchrl_bayessim.diagnosis.selection import Selection
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchrl_bayessim.diagnosis.objective import Objective, Point, Unit
-from torchrl_bayessim.diagnosis.refit import refit, with_width
+from torchrl_bayessim.diagnosis.refit import Fit, refit, with_width
 from torchrl_bayessim.effects.action import ActionBias
 from torchrl_bayessim.effects.joints import CoulombFriction
 
@@ -85,3 +85,17 @@ def test_derivatives_are_wide_where_residuals_are_rough():
 def test_without_parameters_derivatives_stay_narrow():
     objective = Rough(0.05, coordinates=1)
     assert with_width(objective, Point(np.zeros(1))) is objective
+
+
+def test_a_strength_is_known_less_well_beside_what_else_was_fitted():
+    """By hand: two columns at a correlation of 0.8 leave 1 - 0.64 of the precision."""
+    rng = np.random.default_rng(0)
+    basis = np.linalg.qr(rng.normal(size=(3000, 3)))[0]
+    column, other = basis[:, 0] * 40.0, basis[:, 1]
+    slope = 25.0 * (0.8 * basis[:, 0] + 0.6 * other)
+    innovations = rng.normal(size=(100, 30))
+    alone = Fit(Point(np.zeros(0), {RIGHT: 0.3}), (RIGHT,), innovations, column[:, None])
+    beside = Fit(alone.point, alone.units, innovations, alone.jacobian, slope[:, None])
+    assert beside.covariance(1.0).shape == (1, 1)
+    ratio = beside.covariance(1.0)[0, 0] / alone.covariance(1.0)[0, 0]
+    assert ratio == pytest.approx(1 / (1 - 0.64), rel=0.3)

@@ -10,9 +10,10 @@ from dataclasses import replace
 from ..effects.effect import Effect
 from ..effects.transmission import ServoDeadBand
 from .alternatives import kind
+from .elimination import parts, without_idle
 from .model import Model, as_good
 from .objective import Objective
-from .selection import Selection, parts, without_idle
+from .selection import Selection
 
 _SAME = 2.0  # of a deviance: what fits of one and the same law may differ by
 _LAST = 0.01  # of what an effect explains: too little to prefer one law to another

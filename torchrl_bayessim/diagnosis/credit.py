@@ -11,8 +11,9 @@ from math import factorial
 
 import numpy as np
 
+from .elimination import parts
 from .objective import Objective, Unit
-from .selection import Selection, parts
+from .selection import Selection
 
 _LEAST = 0.005  # of the credit, to be named beside another cause
 _MORE = 1.5  # times what is left with it, without

@@ -7,21 +7,24 @@ spring that hardens, leaves a force of its own, which the next round would take 
 
 from __future__ import annotations
 
-__all__ = ["with_fitted_forms"]
+__all__ = ["bendable", "with_fitted_forms", "with_forms_anew", "with_slopes_of_forms"]
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..effects.effect import Reach
 from ..effects.units import slides
 from .model import LIKELY, WHITE, Model, judged, price
 from .objective import Objective, Point, Unit
-from .refit import refit, with_prior
+from .refit import Fit, refit, with_prior
 
-_STEPS = 4  # of Gauss and Newton
+Array = NDArray[np.float64]
+_STEPS = 12  # of Gauss and Newton, at most
 _WHITER = 4.0  # times the price of a number, where a model leaves noise alone
+_SHORTER = (0.25, 0.05)  # of a step that leads nowhere better
 _FARTHEST = 10.0  # times the change that shows, in one step: laws are not linear in these numbers
 
 
@@ -35,46 +38,109 @@ class _Shift:
     least: float
     most: float
 
-    @property
-    def bends(self) -> bool:
-        """Whether it bends a law, rather than places a wave."""
-        return bool(np.isfinite(self.least))
+    def paid(self, offered: Collection[Unit]) -> bool:
+        """Return whether the number has been fitted: of a wave, or none that was offered."""
+        if not np.isfinite(self.least):
+            return True
+        value, alike = _value(self), (u for u in offered if u.name == self.unit.name)
+        return not any(unit.effect.form.get(self.number) == value for unit in alike)
 
 
-def with_fitted_forms(train: Objective, validation: Objective, model: Model) -> Model:
+def with_fitted_forms(
+    train: Objective, validation: Objective, model: Model, offered: Collection[Unit]
+) -> Model:
     """Return the model with what its effects have free beside their strengths fitted, too.
 
     What is free (`Effect.free`: the frequency of a periodic force, how a spring hardens) moves the
     innovations linearly where it changes little, and is solved for together with parameters and
     strengths. The model itself comes back where nothing is gained that chance would not often give:
     what bends a law is priced like strengths, several where the law leaves noise alone anyway; what
-    was read off a grid has been paid for.
+    was read off a grid, or bent before another effect came in, has been paid for.
+
+    Args:
+        train: Where models are fitted.
+        validation: Where they are judged.
+        model: To start from.
+        offered: Units with effects as they were offered, of which no number has been fitted.
     """
-    placed = _fitted((train, validation), model, bends=False)
-    count = sum(shift.bends for shift in _shifts(train, placed))
+    sets = train, validation
+    placed = _fitted(sets, model, lambda shift: shift.paid(offered))
+    count = sum(not shift.paid(offered) for shift in _shifts(train, placed))
     if not count:
         return placed
     needed = price(placed) * (_WHITER if placed.mean_square < WHITE else 1.0)
-    return _fitted((train, validation), placed, bends=True, needed=LIKELY + count * needed)
+    return _fitted(sets, placed, needed=LIKELY + count * needed)
+
+
+def bendable(train: Objective, units: Iterable[Unit]) -> bool:
+    """Return whether the law of any of the units has a number that bends it."""
+    return any(
+        np.isfinite(least)
+        for unit in units
+        for _, least, _ in unit.effect.free(_reach(train, unit)).values()
+    )
+
+
+def with_forms_anew(
+    train: Objective, validation: Objective, model: Model, offered: Collection[Unit]
+) -> Model:
+    """Return the model with what is free fitted again, once another effect has been taken out.
+
+    What was bent to make up for that effect is straight again where it need not be bent: laws are
+    fitted from how they were offered, too, and stay that way unless the bent ones explain more.
+    """
+    sets, bent = (train, validation), with_fitted_forms(train, validation, model, offered)
+    shifts = [s for s in _shifts(train, model) if s.paid(offered) and np.isfinite(s.least)]
+    if not shifts:
+        return bent
+    changes = [_nearest_offered(shift, offered) - _value(shift) for shift in shifts]
+    (straight,) = judged(*sets, refit(train, [_with(model.fit.point, shifts, changes)]))
+    straight = with_fitted_forms(*sets, straight, offered)
+    return straight if straight.fit.cost < bent.fit.cost + price(model) else bent
+
+
+def _nearest_offered(shift: _Shift, offered: Collection[Unit]) -> float:
+    """Return the number as it was offered, the nearest where it was with several."""
+    values = {float(u.effect.form[shift.number]) for u in offered if u.name == shift.unit.name}
+    return min(values, key=lambda value: abs(value - _value(shift)))
+
+
+def with_slopes_of_forms(train: Objective, model: Model, offered: Collection[Unit]) -> Model:
+    """Return the model with the derivatives of its fit by the numbers that were fitted.
+
+    A strength is known less well beside them: a spring that is softer and hardens more is much the
+    same spring.
+    """
+    shifts = [shift for shift in _shifts(train, model) if shift.paid(offered)]
+    if not shifts:
+        return model
+    return replace(model, fit=replace(model.fit, slopes=_slopes(train, model.fit, shifts)[0]))
 
 
 def _fitted(
-    sets: tuple[Objective, Objective], model: Model, *, bends: bool, needed: float = LIKELY
+    sets: tuple[Objective, Objective],
+    model: Model,
+    moves: Callable[[_Shift], bool] = lambda _: True,
+    *,
+    needed: float = LIKELY,
 ) -> Model:
     """Return the model with what is free fitted, or itself where that gains too little.
 
     Args:
         sets: Where models are fitted, and judged.
         model: To start from.
-        bends: Whether what bends a law is fitted too.
+        moves: Which numbers are fitted.
         needed: Deviance to gain.
     """
     train, best = sets[0], model
     for _ in range(_STEPS):
-        shifts = [shift for shift in _shifts(train, best) if bends or not shift.bends]
+        shifts = [shift for shift in _shifts(train, best) if moves(shift)]
         if not shifts:
             return model
-        fitted = refit(train, [_moved(train, best, shifts)], iterations=2)[0]
+        whole, *shorter = _moved(train, best, shifts)
+        fitted = refit(train, [whole], iterations=2)[0]
+        if fitted.cost >= best.fit.cost:
+            fitted = min(refit(train, shorter, iterations=2), key=lambda fit: fit.cost)
         gained = best.fit.cost - fitted.cost
         if gained <= 0:
             break
@@ -107,22 +173,30 @@ def _reach(train: Objective, unit: Unit) -> Reach:
     return Reach(position, velocity, time, slides(robot, joint))
 
 
-def _moved(train: Objective, model: Model, shifts: Sequence[_Shift]) -> Point:
-    """Return where one step of Gauss and Newton leads."""
+def _moved(train: Objective, model: Model, shifts: Sequence[_Shift]) -> list[Point]:
+    """Return where one step of Gauss and Newton leads, and shorter ones."""
     fit, size = model.fit, len(model.fit.point.z)
-    widths = [_inwards(shift) for shift in shifts]
-    tries = [_with(fit.point, [s], [w]) for s, w in zip(shifts, widths, strict=True)]
-    changes = (train(tries) - fit.innovations).reshape(len(shifts), -1)
-    columns = np.concatenate([fit.jacobian, changes.T], axis=1)
+    slopes, widths = _slopes(train, fit, shifts)
+    columns = np.concatenate([fit.jacobian, slopes], axis=1)
     left = np.r_[fit.innovations.ravel(), fit.point.z]
     step = -np.linalg.lstsq(with_prior(columns, size), left, rcond=None)[0]
-    strengths = {
-        unit: unit.inside(fit.point.strengths[unit] + unit.high * step[size + i])
-        for i, unit in enumerate(fit.units)
-    }
-    times = np.clip(step[size + len(fit.units) :], -_FARTHEST, _FARTHEST).tolist()
-    steps = [width * time for width, time in zip(widths, times, strict=True)]
-    return _with(Point(fit.point.z + step[:size], strengths), shifts, steps)
+    moves = np.clip(step[size + len(fit.units) :], -_FARTHEST, _FARTHEST) * widths
+    points = []
+    for part in (1.0, *_SHORTER):
+        strengths = {
+            unit: unit.inside(fit.point.strengths[unit] + part * unit.high * step[size + i])
+            for i, unit in enumerate(fit.units)
+        }
+        there = Point(fit.point.z + part * step[:size], strengths)
+        points.append(_with(there, shifts, (part * moves).tolist()))
+    return points
+
+
+def _slopes(train: Objective, fit: Fit, shifts: Sequence[_Shift]) -> tuple[Array, list[float]]:
+    """Return what a change of each number does, ``(S·KC, N)``, and the changes."""
+    widths = [_inwards(shift) for shift in shifts]
+    tries = [_with(fit.point, [s], [w]) for s, w in zip(shifts, widths, strict=True)]
+    return (train(tries) - fit.innovations).reshape(len(shifts), -1).T, widths
 
 
 def _inwards(shift: _Shift) -> float:

@@ -35,12 +35,14 @@ class Fit:
         innovations: Weighted innovations there, shape ``(S, KC)``.
         jacobian: Their derivative, by standardised parameters then by strengths as fractions of
             their range, shape ``(S·KC, D + U)``.
+        slopes: The derivative by what else of the effects was fitted (`form_fit`), ``(S·KC, N)``.
     """
 
     point: Point
     units: tuple[Unit, ...]
     innovations: Array
     jacobian: Array
+    slopes: Array | None = None
 
     @property
     def misfit(self) -> float:
@@ -91,21 +93,22 @@ class Fit:
 
         The larger of what the dispersion φ of the innovations says, ``φ (JᵀJ + φ P)⁻¹`` with the
         prior's precision ``P``, and of the sandwich estimate over segments, which knows that the
-        innovations of one segment may err together.
+        innovations of one segment may err together. What else was fitted is free in both.
         """
         size = self.jacobian.shape[1]
         parameters = size - len(self.units)
-        precision = np.diag(np.r_[np.ones(parameters), np.full(len(self.units), 1e-6)])
-        bread = np.linalg.inv(self.jacobian.T @ self.jacobian / dispersion + precision)
+        jacobian = self.jacobian if self.slopes is None else np.c_[self.jacobian, self.slopes]
+        precision = np.full(jacobian.shape[1], 1e-6)
+        precision[:parameters] = 1.0
+        bread = np.linalg.inv(jacobian.T @ jacobian / dispersion + np.diag(precision))
         segments = self.innovations.shape[0]
-        scores = np.einsum(
-            "smd,sm->sd", self.jacobian.reshape(segments, -1, size), self.innovations
-        )
+        by_segment = jacobian.reshape(segments, -1, jacobian.shape[1])
+        scores = np.einsum("smd,sm->sd", by_segment, self.innovations)
         meat = (scores / dispersion).T @ (scores / dispersion)
         sandwich = bread @ meat @ bread
         larger = np.maximum(np.diag(sandwich) / np.maximum(np.diag(bread), 1e-30), 1.0)
         scale = np.sqrt(larger)
-        return np.asarray(bread * scale[:, None] * scale, dtype=np.float64)
+        return np.asarray(bread * scale[:, None] * scale, dtype=np.float64)[:size, :size]
 
 
 def refit(

@@ -9,17 +9,18 @@ best few; afterwards every unit has to show that the model needs it.
 
 from __future__ import annotations
 
-__all__ = ["Selection", "parts", "select", "without_idle"]
+__all__ = ["Selection", "select"]
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from .alternatives import alternatives, exchanged
+from .elimination import eliminated, without_stopgaps
 from .explanations import bent, compare, explanations
-from .form_fit import with_fitted_forms
+from .form_fit import with_fitted_forms, with_forms_anew, with_slopes_of_forms
 from .further_effects import identified, nothing_left
 from .model import Model, as_good, criterion, gain, judged, needed
 from .objective import Objective, Point, Unit
@@ -30,9 +31,7 @@ from .shapes import with_shapes
 _MOST = 4  # effects in one explanation
 _UNSEEN = 1.0  # a deviance that no test can detect
 _EXCHANGES = 3  # of effects for others in their places
-_IDLE = 1e-3  # of the deviance that an effect explains at another place
 _EQUAL = 0.1  # of the deviance
-_APART = 3  # effects without each of which a model is fitted with derivatives of its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +80,7 @@ def select(
         progress: Told what is done.
     """
     start = judged(train, validation, [nominal])[0]
-    best, tried, screens, p_values = start, [start], [], []
+    best, tried, screens, p_values, offered = start, [start], [], [], units
     timestep = float(train.predictor.system.task.model.opt.timestep)
     worth = partial(identified, start, timestep=timestep)
     for round_number in range(_MOST):
@@ -100,16 +99,24 @@ def select(
         models = judged(train, validation, explanations(train, now))
         tried += models
         better = _chosen(best, models)
-        better = _fewest((train, validation), best, better, models, worth=worth)
+        better = _fewest((train, validation), best, better, models, worth=worth, offered=offered)
         if better is None or not worth(best, better, models):
             break
-        best = with_fitted_forms(train, validation, _exactly(train, validation, better))
-        new = [unit for unit in best.units if unit not in better.units]
-        units = with_shapes(units, new)  # in the places of what was read off a grid
-        tried += [best] if new else []
+        best = _exactly(train, validation, better)
+        best = with_fitted_forms(train, validation, best, offered)
+        units = with_shapes(units, _beyond(better, best))  # in the places of what was off a grid
+        tried += [best] if _beyond(better, best) else []
+    progress("taking out what is not needed")
+    needs, dropped = eliminated(train, validation, best)
+    if len(needs.units) < len(best.units):
+        needs = with_forms_anew(train, validation, needs, offered)
+    needs = without_stopgaps(train, validation, needs, offered)
+    units = with_shapes(units, _beyond(best, needs))
+    tried += [*dropped, needs]
     best, others = _settled(
-        train, validation, best, units=units, tried=tried, first=screens[0], progress=progress
+        train, validation, needs, units=units, tried=tried, first=screens[0], progress=progress
     )
+    best = with_slopes_of_forms(train, best, offered)
     return Selection(start, best, tuple(screens), tuple(p_values), tuple(tried), others)
 
 
@@ -123,10 +130,7 @@ def _settled(
     first: Screen,
     progress: Callable[[str], None],
 ) -> tuple[Model, dict[str, tuple[Model, ...]]]:
-    """Return what is left without the effects not needed, and the models with others instead."""
-    progress("taking out what is not needed")
-    best, dropped = _eliminated(train, validation, best)
-    tried += dropped
+    """Return the best model, after exchanges, and the models with others instead."""
     for exchanges in range(_EXCHANGES + 1):
         if not best.units:
             break
@@ -136,9 +140,14 @@ def _settled(
         better = exchanged(best, others)
         if better is best or exchanges == _EXCHANGES:
             return best, others
-        best, dropped = _eliminated(train, validation, _exactly(train, validation, better))
+        best, dropped = eliminated(train, validation, _exactly(train, validation, better))
         tried += dropped
     return best, {}
+
+
+def _beyond(base: Model, model: Model) -> list[Unit]:
+    """Return the units that a model has and its base has not."""
+    return [unit for unit in model.units if unit not in base.units]
 
 
 def _beside(model: Model, found: Sequence[Unit]) -> list[Unit]:
@@ -215,6 +224,7 @@ def _fewest(
     models: Sequence[Model],
     *,
     worth: Callable[..., bool],
+    offered: Sequence[Unit],
 ) -> Model | None:
     """Return the best model, or one with a single new effect where more are a stopgap.
 
@@ -227,77 +237,10 @@ def _fewest(
         return better
     if not worth(smaller, better, models):
         return smaller
-    fitted = with_fitted_forms(*sets, smaller)
+    fitted = with_fitted_forms(*sets, smaller, offered)
     return fitted if fitted is not smaller and as_good(better, fitted) else better
 
 
 def _new_names(base: Model, model: Model) -> set[str]:
     """Return the effects that a model has beside those of its base."""
-    return {unit.name for unit in model.units if unit not in base.units}
-
-
-def _eliminated(train: Objective, validation: Objective, model: Model) -> tuple[Model, list[Model]]:
-    """Take out, one at a time, units without which the data are explained as well."""
-    tried: list[Model] = []
-    while model.units:
-        smaller = _without_each(train, validation, model)
-        tried += smaller
-        criteria = [criterion(m, model.dispersion()) for m in smaller]
-        best = int(np.argmin(criteria))
-        loss = gain(smaller[best], model)
-        if criteria[best] > criterion(model, model.dispersion()) and loss > needed(
-            smaller[best], model
-        ):
-            idle = _idle_place(model, smaller)
-            if idle is None:
-                break
-            best = idle
-        model = smaller[best]
-    there = refit(train, [model.fit.point], iterations=0)[0]
-    return replace(model, fit=there), tried
-
-
-def _without_each(train: Objective, validation: Objective, model: Model) -> list[Model]:
-    """Return the model without each of its units, fitted."""
-    without = [model.fit.without(unit) for unit in model.units]
-    few = len(without) <= _APART
-    fits = refit(train, [fit.point for fit in without], origins=without, renew=few)
-    return judged(train, validation, fits)
-
-
-def without_idle(train: Objective, validation: Objective, model: Model) -> Model:
-    """Return a model without the places of an effect that next to nothing is due to."""
-    while len({unit.name for unit in model.units}) < len(model.units):
-        smaller = _without_each(train, validation, model)
-        idle = _idle_place(model, smaller)
-        if idle is None:
-            break
-        model = smaller[idle]
-    return model
-
-
-def _idle_place(model: Model, smaller: Sequence[Model]) -> int | None:
-    """Return the unit of an effect at several places which next to nothing is due to, if any.
-
-    Where a model is a little off everywhere, any strength mends some of it, surely and for nothing.
-
-    Args:
-        model: With all units.
-        smaller: Without each of them.
-    """
-    names = [unit.name for unit in model.units]
-    total = model.deviances().sum()
-    lost = [float(m.deviances().sum() - total) for m in smaller]
-    least = int(np.argmin(lost))
-    alike = [loss for loss, name in zip(lost, names, strict=True) if name == names[least]]
-    return least if len(alike) > 1 and lost[least] < _IDLE * max(alike) else None
-
-
-def parts(train: Objective, validation: Objective, model: Model) -> list[Model]:
-    """Return the model without each of its effects, fitted."""
-    strengths = model.fit.point.strengths
-    starts = [
-        Point(model.fit.point.z, {u: s for u, s in strengths.items() if u.name != out})
-        for out in dict.fromkeys(unit.name for unit in strengths)
-    ]
-    return judged(train, validation, refit(train, starts))
+    return {unit.name for unit in _beyond(base, model)}

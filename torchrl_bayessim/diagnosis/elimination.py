@@ -1,0 +1,131 @@
+"""What an explanation does not need: effects taken out again, one at a time.
+
+A forward search takes in what makes up for what it has not found yet. Afterwards every effect has
+to show that the model needs it.
+"""
+
+from __future__ import annotations
+
+__all__ = ["eliminated", "parts", "without_idle", "without_stopgaps"]
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from .form_fit import bendable, with_forms_anew
+from .model import Model, criterion, gain, judged, needed
+from .objective import Objective, Point, Unit
+from .refit import refit
+
+_IDLE = 1e-3  # of the deviance that an effect explains at another place
+_APART = 3  # effects without each of which a model is fitted with derivatives of its own
+
+
+def eliminated(train: Objective, validation: Objective, model: Model) -> tuple[Model, list[Model]]:
+    """Take out, one at a time, units without which the data are explained as well."""
+    tried: list[Model] = []
+    while model.units:
+        smaller = _without_each(train, validation, model)
+        tried += smaller
+        criteria = [criterion(m, model.dispersion()) for m in smaller]
+        best = int(np.argmin(criteria))
+        loss = gain(smaller[best], model)
+        if criteria[best] > criterion(model, model.dispersion()) and loss > needed(
+            smaller[best], model
+        ):
+            idle = _idle_place(model, smaller)
+            if idle is None:
+                break
+            best = idle
+        model = smaller[best]
+    there = refit(train, [model.fit.point], iterations=0)[0]
+    return replace(model, fit=there), tried
+
+
+def _without_each(train: Objective, validation: Objective, model: Model) -> list[Model]:
+    """Return the model without each of its units, fitted."""
+    without = [model.fit.without(unit) for unit in model.units]
+    few = len(without) <= _APART
+    fits = refit(train, [fit.point for fit in without], origins=without, renew=few)
+    return judged(train, validation, fits)
+
+
+def without_idle(train: Objective, validation: Objective, model: Model) -> Model:
+    """Return a model without the places of an effect that next to nothing is due to."""
+    while len({unit.name for unit in model.units}) < len(model.units):
+        smaller = _without_each(train, validation, model)
+        idle = _idle_place(model, smaller)
+        if idle is None:
+            break
+        model = smaller[idle]
+    return model
+
+
+def _idle_place(model: Model, smaller: Sequence[Model]) -> int | None:
+    """Return the unit of an effect at several places which next to nothing is due to, if any.
+
+    Where a model is a little off everywhere, any strength mends some of it, surely and for nothing.
+
+    Args:
+        model: With all units.
+        smaller: Without each of them.
+    """
+    names = [unit.name for unit in model.units]
+    total = model.deviances().sum()
+    lost = [float(m.deviances().sum() - total) for m in smaller]
+    least = int(np.argmin(lost))
+    alike = [loss for loss, name in zip(lost, names, strict=True) if name == names[least]]
+    return least if len(alike) > 1 and lost[least] < _IDLE * max(alike) else None
+
+
+def parts(
+    train: Objective,
+    validation: Objective,
+    model: Model,
+    *,
+    of: Callable[[Collection[Unit]], bool] = lambda _: True,
+) -> list[Model]:
+    """Return the model without each of its effects, fitted.
+
+    Args:
+        train: Where models are fitted.
+        validation: Where they are judged.
+        model: With all effects.
+        of: Told what is left: whether that is asked for.
+    """
+    strengths = model.fit.point.strengths
+    without = [
+        {u: s for u, s in strengths.items() if u.name != out}
+        for out in dict.fromkeys(unit.name for unit in strengths)
+    ]
+    starts = [Point(model.fit.point.z, left) for left in without if of(left)]
+    return judged(train, validation, refit(train, starts))
+
+
+def without_stopgaps(
+    train: Objective, validation: Objective, model: Model, offered: Collection[Unit]
+) -> Model:
+    """Return the model without effects that others replace once their laws are fitted anew.
+
+    A magnet's pull over a short way makes up for how a spring hardens, and beside it the spring
+    need not harden.
+
+    Args:
+        train: Where models are fitted.
+        validation: Where they are judged.
+        model: To start from.
+        offered: Units with effects as they were offered, of which no number has been fitted.
+    """
+    while len({unit.name for unit in model.units}) > 1:
+        smaller = [
+            fitted
+            for part in parts(train, validation, model, of=lambda left: bendable(train, left))
+            if (fitted := with_forms_anew(train, validation, part, offered)) is not part
+        ]
+        limit = criterion(model, model.dispersion())
+        enough = [m for m in smaller if criterion(m, model.dispersion()) < limit]
+        if not enough:
+            break
+        model = min(enough, key=lambda one: criterion(one, model.dispersion()))
+    return model
