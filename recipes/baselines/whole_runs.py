@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torchrl_bayessim.diagnosis.noise import assumed_noise
 from torchrl_bayessim.diagnosis.objective import Objective, Unit, origin, units_of
 from torchrl_bayessim.diagnosis.prediction import Predictor
-from torchrl_bayessim.diagnosis.preparation import split
 from torchrl_bayessim.diagnosis.segments import Segments, cut
+from torchrl_bayessim.diagnosis.splits import split
 from torchrl_bayessim.diagnosis.time_steps import with_fewest_steps
 from torchrl_bayessim.diagnosis.whitening import Whitening
 from torchrl_bayessim.effects.catalogue import CATALOGUE, effect

@@ -56,8 +56,10 @@ def test_a_spring_and_a_shaking_force_are_found_though_magnets_imitated_the_spri
     """Seed 2: the search takes cogging first, which a spring that hardens replaces at the end."""
     stiffness, hardening, strength = 1.588, 7.62, 0.263
     report = diagnosed(
-        lambda t, q: -stiffness * q * (1 + hardening * q**2)
-        - strength * np.cos(2 * np.pi * FREQUENCY * t + 0.5),
+        lambda t, q: (
+            -stiffness * q * (1 + hardening * q**2)
+            - strength * np.cos(2 * np.pi * FREQUENCY * t + 0.5)
+        ),
         2,
     )
     names = [effect.name for effect in report.effects]

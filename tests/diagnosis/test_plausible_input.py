@@ -12,8 +12,8 @@ from torchrl_bayessim.diagnosis.holds import bridged
 from torchrl_bayessim.diagnosis.modes import Trajectories
 from torchrl_bayessim.diagnosis.objective import Point, origin, pushes_of
 from torchrl_bayessim.diagnosis.prediction import Predictor
-from torchrl_bayessim.diagnosis.preparation import split
 from torchrl_bayessim.diagnosis.shapes import shaped
+from torchrl_bayessim.diagnosis.splits import split
 from torchrl_bayessim.effects.transmission import servos
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.logs.columns import Columns

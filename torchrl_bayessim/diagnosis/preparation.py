@@ -1,19 +1,13 @@
-"""From logs to a fitted nominal simulator: split, noise floor, horizon, segments, refit.
-
-The data are split by trajectory: fits and screening see the training logs, the choice of effects
-the validation logs too, and the test logs are opened once, for the figures that are reported.
-"""
+"""From logs to a fitted nominal simulator: split, noise floor, horizon, segments, refit."""
 
 from __future__ import annotations
 
-__all__ = ["Prepared", "prepare", "split"]
+__all__ = ["Prepared", "prepare"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import cycle, pairwise
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ..effects.transmission import servos
@@ -28,6 +22,7 @@ from .objective import Objective, Point, Unit, origin, parameters_at
 from .prediction import Predictor
 from .refit import Fit, refit, with_width
 from .segments import Segments, cut, cut_for_fits
+from .splits import dealt_anew, few, split
 from .time_steps import with_fewest_steps
 from .velocity_errors import with_velocity_errors
 
@@ -39,10 +34,6 @@ _STEPS = 20  # over which a joint that nobody measured would be seen
 _ROUNDS = 3  # in which what nobody measured and the parameters are fitted in turn
 _MANY = 60  # segments on which they are
 _FEW = 8  # segments on which the parameters are fitted first
-_PIECE = 0.25  # of the median log's length, below which it is a piece of one
-_AS_LONG = 1.25  # ratio of two lengths that count as one
-_APART = 3  # runs from which each split has one of its own
-_DEAL = "train", "test", "validation", "train", "train", "test", "validation", "train"
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,50 +72,6 @@ class Prepared:
         return replace(self, alarms=(*self.alarms, *alarms))
 
 
-def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
-    """Return training, validation and test logs.
-
-    From the longest to the shortest, and among those about as long from the widest motion to the
-    least, of every four logs the first and last train, one tests, one validates: what acts in wide
-    motion only should act in each split. Pieces that are much shorter than the others train: over
-    them no error grows. Fewer than three logs are each divided in time: half, a quarter, a quarter.
-    """
-    parts: dict[str, list[Log]] = {"train": [], "validation": [], "test": []}
-    whole, pieces = _whole(logs)
-    if len(whole) >= _APART:
-        for log, name in zip(_ordered(whole), cycle(_DEAL), strict=False):
-            parts[name].append(log)
-    else:
-        for log in whole:
-            ends = 0, len(log) // 2, 3 * len(log) // 4, len(log)
-            for name, (begin, end) in zip(parts, pairwise(ends), strict=True):
-                parts[name].append(_rows(log, begin, end))
-    parts["train"] += pieces
-    return parts
-
-
-def _whole(logs: Sequence[Log]) -> tuple[list[Log], list[Log]]:
-    """Return the logs, and those that are pieces, much shorter than the others."""
-    least = _PIECE * float(np.median([len(log) for log in logs])) if logs else 0.0
-    return [log for log in logs if len(log) >= least], [log for log in logs if len(log) < least]
-
-
-def _ordered(logs: Sequence[Log]) -> list[Log]:
-    """Return the longest first; of those about as long, what moves and commands most."""
-    peaks = np.array([torch.cat([log.ctrl, log.qvel], 1).abs().amax(0).numpy() for log in logs])
-    width = (peaks / np.maximum(peaks.max(0), 1e-12)).mean(1)
-    length = np.round(np.log([len(log) for log in logs]) / np.log(_AS_LONG))
-    return [logs[at] for at in np.lexsort((-width, -length))]
-
-
-def _rows(log: Log, begin: int, end: int) -> Log:
-    part = slice(begin, end)
-    arrays = {n: getattr(log, n)[part] for n in ("time", "qpos", "qvel", "ctrl")}
-    return replace(
-        log, name=f"{log.name} [{begin}:{end}]", first_row=log.first_row + begin, **arrays
-    )
-
-
 def prepare(
     system: System,
     logs: Sequence[Log],
@@ -159,7 +106,7 @@ def prepare(
     if rows <= max(_FEWEST, horizon or 0):
         expected = f"runs of more than {max(_FEWEST, horizon or 0)} rows in every split"
         raise ValueError(message(expected, f"{rows} rows", hint="record longer"))
-    if len(_whole(logs)[0]) < _APART:
+    if few(logs):
         alarms.append(
             f"{len(logs)} trajectories: training, validation and test are stretches of the same "
             "runs, and intervals are too narrow"
@@ -181,12 +128,34 @@ def prepare(
     parts = _in_contact(predictor, parts, noise=noise, history=history)
     if horizon is None:
         horizon = mode.horizon(predictor, parts, units=units, noise=noise, history=history)
-    pieces = {
-        name: mode.cut(part, horizon, history=history, most=max(12, _ROWS[name] // horizon))
-        for name, part in parts.items()
-    }
-    nominal, sets = _nominal(predictor, pieces, mode, noise=noise, generator=generator)
+
+    def fitted(parts: Mapping[str, list[Log]]) -> tuple[Fit, dict[str, Objective]]:
+        pieces = {
+            name: mode.cut(part, horizon, history=history, most=max(12, _ROWS[name] // horizon))
+            for name, part in parts.items()
+        }
+        return _nominal(predictor, pieces, mode, noise=noise, generator=generator)
+
+    nominal, sets = fitted(parts)
+    if not few(logs):
+        again = dealt_anew(parts, _by_log(parts, nominal, sets))
+        if again is not parts:
+            parts = again
+            nominal, sets = fitted(parts)
     return Prepared(predictor, sets, parts, noise, source, horizon, nominal, tuple(alarms), mode)
+
+
+def _by_log(
+    parts: Mapping[str, Sequence[Log]], nominal: Fit, sets: Mapping[str, Objective]
+) -> dict[str, Array]:
+    """Return the mean squared innovation of each training and validation log."""
+    left = {"train": nominal.innovations, "validation": sets["validation"]([nominal.point])[0]}
+    found = {}
+    for name, innovations in left.items():
+        of, count = sets[name].segments.log, len(parts[name])
+        total = np.bincount(of, (innovations**2).mean(-1), minlength=count)
+        found[name] = total / np.maximum(np.bincount(of, minlength=count), 1)
+    return found
 
 
 def _in_contact(

@@ -18,10 +18,11 @@ from .chance import Chance
 from .contacts import settled
 from .holds import Hold
 from .objective import Point, Unit, strengths_of
-from .preparation import Prepared, split
+from .preparation import Prepared
 from .report import Candidate, Finding
 from .selection import Selection
 from .shrinkage import Shrinkage
+from .splits import split
 
 _DRAWS = 1000
 
