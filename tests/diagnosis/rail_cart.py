@@ -26,12 +26,15 @@ def cart():
     return System(task=task, physics=MujocoPhysics(*BOUNDS), prior=BoxPrior(BOUNDS))
 
 
-def ride(rng, steps, force, *, noise, finer=1):
-    """Return a run on which ``force(time, position)`` acts, with so much finer time steps."""
+def ride(rng, steps, force, *, noise, finer=1, scale=1.0):
+    """Return a run on which ``force(time, position)`` acts, with so much finer time steps.
+
+    Commands are ``scale`` times the usual ones.
+    """
     model = mujoco.MjModel.from_xml_string(CART)
     model.opt.timestep /= finer
     data = mujoco.MjData(model)
-    u, rows = commands(rng, steps), []
+    u, rows = scale * commands(rng, steps), []
     for k in range(steps):
         rows.append((data.qpos[0], data.qvel[0]))
         data.ctrl[0] = u[k]

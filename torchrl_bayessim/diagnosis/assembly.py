@@ -26,7 +26,7 @@ from .late_rows import late_row_alarms
 from .location import location
 from .model import Model
 from .objective import Objective, Point, Unit
-from .odd_runs import odd_run_alarms, odd_runs, run_errors
+from .odd_runs import odd_run_alarms, odd_runs, run_errors, unexplained_run_alarms
 from .preparation import Prepared
 from .report import Candidate, Gap, Parameter, Report
 from .rollout import rollout_errors, worse_rollouts
@@ -103,6 +103,9 @@ def assemble(
     )
     if verdict == "none":
         more += whole_run_alarm(prepared, points["refit"])
+        more += unexplained_run_alarms(
+            run_errors(prepared.sets, prepared.logs, selection.nominal.fit.point)
+        )
     if verdict == "unknown":
         more += late_row_alarms(prepared.sets["train"], selection.nominal.fit)
     if verdict in {"none", "unknown", "not_testable"}:
@@ -116,7 +119,7 @@ def assemble(
         *prepared.alarms,
         *(str(f) for f in findings),
         *_absorbed(parameters),
-        *odd_run_alarms(errors),
+        *(odd_run_alarms(errors) if verdict != "none" else ()),
         *by_integration,
         *divergence_alarms(prepared.sets["test"], told),
         *more,

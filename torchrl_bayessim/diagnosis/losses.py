@@ -5,7 +5,7 @@ and their mean and covariance say little; but where it happened it can be seen. 
 every pattern of a few losses is tried (`loss_law`), and what must be beaten is the same law without
 losses, where some segments are spoiled by something else: losses have to explain what they spoil,
 and not only that some segments are worse than others. They are looked for in the place of the
-effects that the search found, and those of samples beside them.
+effects that the search found, and beside them.
 
 Effects of commands are linear in them over so few steps, so every pattern is made of one simulation
 per step; those of samples are the simulated values.
@@ -200,9 +200,8 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
     alone = _Alone.of(nominal)
     # what the best explanation without chance gains by the same standard
     found, least = _all_found(nominal, some, alone), sum(alone.costs) - sum(rival.costs)
-    if selection.best.units:
-        other = [unit for unit in some if _apart(unit, selection.best.units)]
-        beside = [replace(one, beside=True) for one in _all_found(best, other, rival)]
+    if selection.best.units and _apart(selection.best.units):
+        beside = [replace(one, beside=True) for one in _all_found(best, some, rival)]
         if _most(beside) > _most(found) - least + _NEEDED:
             found, least = beside, 0.0
     kept = [one for one in found if one.gain > max(_NEEDED, least)]
@@ -226,16 +225,15 @@ def _telling(prepared: Prepared, units: Sequence[Unit]) -> list[Unit]:
     return [u for u in units if isinstance(u.effect, PacketDrop) or not rests[u.direction.index(1)]]
 
 
-def _apart(unit: Unit, others: Sequence[Unit]) -> bool:
+def _apart(others: Sequence[Unit]) -> bool:
     """Return whether losses beside effects could not be another form of those.
 
-    A force law that is not quite the true one errs as a command would that was lost; a lag that is
-    not, and contacts that stick and slip a little otherwise, as samples would.
+    A lag that is not quite the true one, and contacts that stick and slip a little otherwise, err
+    as samples and commands would that were lost.
     """
     known = [unit.effect for unit in others]
     alike = any(e.group == "timing" or e.channel == "sensing" for e in known)
-    alike |= any(isinstance(e, ContactFriction) for e in known)
-    return isinstance(unit.effect, SensorDropout) and not alike
+    return not alike and not any(isinstance(e, ContactFriction) for e in known)
 
 
 def _all_found(data: Mapping[str, _Data], units: Sequence[Unit], alone: _Alone) -> list[Chance]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-__all__ = ["odd_run_alarms", "odd_runs", "run_errors"]
+__all__ = ["odd_run_alarms", "odd_runs", "run_errors", "unexplained_run_alarms"]
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -76,6 +76,31 @@ def odd_run_alarms(errors: Mapping[str, float]) -> list[str]:
         for name, error in errors.items()
         if len(errors) >= 3 and error > _FAR * usual
     ]
+
+
+def unexplained_run_alarms(errors: Mapping[str, float]) -> list[str]:
+    """Return an alarm for each run that exceeds the noise fourfold, though no gap was found.
+
+    Example:
+        >>> unexplained_run_alarms({"a.csv": 44.3, "b.csv": 7.0, "c.csv": 1.2, "d.csv": 1.1})
+        ['a.csv and b.csv are 44.3 and 7 noise floors off, and nothing explains both them and the \
+other runs: did something happen in them?']
+    """
+    far = {name: error for name, error in errors.items() if error > _ODD}
+    if not far:
+        return []
+    names, floors = (_listed(part) for part in (far, (f"{error:.3g}" for error in far.values())))
+    are, them = ("are", "them") if len(far) > 1 else ("is", "it")
+    both = "both them" if len(far) > 1 else "both it"
+    return [
+        f"{names} {are} {floors} noise floors off, and nothing explains {both} and the other runs: "
+        f"did something happen in {them}?"
+    ]
+
+
+def _listed(parts: Iterable[str]) -> str:
+    *most, last = parts
+    return f"{', '.join(most)} and {last}" if most else last
 
 
 def _usual(errors: Mapping[str, float]) -> float:

@@ -1,0 +1,88 @@
+"""Logs are dealt to splits, and anew where what is missing shows in one split alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rail_cart import cart, ride
+
+from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.splits import dealt_anew, few, split
+
+
+def rides(force=lambda t, q: 0.0, steps=(200,) * 8, scales=(1.0,) * 8):
+    """Return runs of so many steps, with commands so much larger than usual."""
+    return [
+        replace(
+            ride(np.random.default_rng(i), n, force, noise=[0.0005, 0.01], scale=scale),
+            name=f"run{i}",
+        )
+        for i, (n, scale) in enumerate(zip(steps, scales, strict=True))
+    ]
+
+
+def names(logs):
+    return [log.name for log in logs]
+
+
+def test_what_shows_in_two_training_runs_alone_is_dealt_to_both_splits():
+    parts = split(rides())
+    assert {name: len(logs) for name, logs in parts.items()} == {
+        "train": 4, "validation": 2, "test": 2,
+    }  # fmt: skip
+    left = {"train": np.array([9.0, 1.1, 0.9, 30.0]), "validation": np.array([1.0, 1.05])}
+    again = dealt_anew(parts, left)
+    assert names(again["train"])[0] == names(parts["train"])[3]
+    assert names(again["validation"])[0] == names(parts["train"])[0]
+    assert names(again["test"]) == names(parts["test"])
+    assert len(again["train"]) == 4
+    assert len(again["validation"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("train", "validation"),
+    [([9.0, 8.0, 9.0, 7.0], [5.0, 4.0]), ([30.0, 1.0, 1.0, 1.0], [1.0, 1.0])],
+    ids=["shows in both", "shows in one run"],
+)
+def test_runs_stay_where_both_splits_show_a_gap_or_only_one_run_has_it(train, validation):
+    parts = split(rides())
+    left = {"train": np.array(train), "validation": np.array(validation)}
+    assert dealt_anew(parts, left) is parts
+
+
+def test_pieces_of_runs_still_train_and_few_runs_are_known():
+    logs = rides()
+    rows = {key: getattr(logs[0], key)[:30] for key in ("time", "qpos", "qvel", "ctrl")}
+    piece = replace(logs[0], name="piece", **rows)
+    parts = split([*logs, piece])
+    at = names(parts["train"]).index("piece")
+    left = {"train": np.ones(5), "validation": np.ones(2)}
+    left["train"][[at, at - 1, at - 2]] = 40.0
+    again = dealt_anew(parts, left)
+    assert "piece" in names(again["train"])
+    assert names(again["validation"]) != names(parts["validation"])
+    assert few(logs[:2])
+    assert not few(logs[:3])
+
+
+def test_a_cause_that_shows_in_two_training_runs_only_is_found():
+    steps, scales = (400, 300, 230, 180, 140, 140, 140, 140), (1, 0.01, 0.01, 1, *[0.01] * 4)
+    logs = rides(lambda t, q: -2.0 * q, steps, scales)
+    assert {"run0", "run3"} <= {*names(split(logs)["train"])}
+    report = diagnose(cart(), None, logs, effects=["parallel_spring", "coulomb_friction"])
+    assert report.verdict == "named_partial"
+    assert [effect.name for effect in report.effects] == ["parallel_spring"]
+    assert report.effects[0].strength == pytest.approx(2.0, rel=0.1)
+    assert {"run0", "run3"} & {*report.audit["train"]}
+    assert {"run0", "run3"} & {*report.audit["validation"]}
+
+
+def test_where_two_runs_only_have_a_spring_and_nothing_is_found_an_alarm_names_them():
+    """Wide runs with it, wide runs without it: no one strength explains both."""
+    free, bound = rides(), rides(lambda t, q: -8.0 * q)
+    logs = [bound[i] if i in {2, 3} else free[i] for i in range(8)]
+    report = diagnose(cart(), None, logs, effects=["parallel_spring", "coulomb_friction"])
+    assert report.verdict != "named"
+    about = next(alarm for alarm in report.alarms if "did something happen in" in alarm)
+    assert "run2" in about
+    assert "run3" in about
