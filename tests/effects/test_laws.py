@@ -104,9 +104,11 @@ def test_laws_bend_as_their_options_say():
         [0.05, -4.9020], 1e-4
     )
     assert changed("action_gain", 0.2, 0.5 * most, bend=-0.5) == pytest.approx([0.575 * most])
-    sag = changed("battery_sag", 0.5, *[2.0] * 11, seconds=1.0, bend=-0.4)
-    assert sag[5] == pytest.approx(2 * (1 - 0.5 * 0.5 * 0.8))
-    assert sag[10] == pytest.approx(2 * (1 - 0.5 * 0.6))
+    sag = changed("battery_sag", 0.5, *[2.0] * 11, seconds=1.0, bend=1.6)
+    assert sag[5] == pytest.approx(2 * (1 - 0.5 * (1 - math.exp(-0.8)) / (1 - math.exp(-1.6))))
+    assert sag[10] == pytest.approx(2 * (1 - 0.5))
+    drift = changed("sensor_drift", 2.0, *[1.0] * 11, settling=3.0)
+    assert drift[10] == pytest.approx(1 + 2.0 * (1 - math.exp(-3.0)) / 3.0)
 
 
 def test_a_battery_loses_no_more_than_half_again_of_its_sag():

@@ -7,7 +7,13 @@ spring that hardens, leaves a force of its own, which the next round would take 
 
 from __future__ import annotations
 
-__all__ = ["bendable", "with_fitted_forms", "with_forms_anew", "with_slopes_of_forms"]
+__all__ = [
+    "bendable",
+    "fitted_numbers",
+    "with_fitted_forms",
+    "with_forms_anew",
+    "with_slopes_of_forms",
+]
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -79,6 +85,11 @@ def bendable(train: Objective, units: Iterable[Unit]) -> bool:
         for unit in units
         for _, least, _ in unit.effect.free(_reach(train, unit)).values()
     )
+
+
+def fitted_numbers(train: Objective, model: Model, offered: Collection[Unit]) -> int:
+    """Return how many numbers of laws were fitted."""
+    return sum(shift.paid(offered) for shift in _shifts(train, model))
 
 
 def with_forms_anew(

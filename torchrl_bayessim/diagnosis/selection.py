@@ -20,9 +20,15 @@ import numpy as np
 from .alternatives import alternatives, exchanged
 from .elimination import eliminated, without_stopgaps
 from .explanations import bent, compare, explanations
-from .form_fit import with_fitted_forms, with_forms_anew, with_slopes_of_forms
+from .form_fit import (
+    bendable,
+    fitted_numbers,
+    with_fitted_forms,
+    with_forms_anew,
+    with_slopes_of_forms,
+)
 from .further_effects import identified, nothing_left
-from .model import Model, as_good, criterion, gain, judged, needed
+from .model import WHITE, Model, as_good, criterion, gain, judged, needed, price
 from .objective import Objective, Point, Unit
 from .refit import Fit, refit
 from .screening import Screen
@@ -30,6 +36,7 @@ from .shapes import with_shapes
 
 _MOST = 4  # effects in one explanation
 _UNSEEN = 1.0  # a deviance that no test can detect
+_FORMS = 3  # effects that are tried in other forms in one round
 _EXCHANGES = 3  # of effects for others in their places
 _EQUAL = 0.1  # of the deviance
 
@@ -228,17 +235,44 @@ def _fewest(
 ) -> Model | None:
     """Return the best model, or one with a single new effect where more are a stopgap.
 
-    Or where that effect explains as much in another form, which the others imitate.
+    Or where that effect explains as much in another form, which others imitate.
     """
-    if better is None or len(_new_names(base, better)) < 2:
+    if better is None:
+        return None
+    singles = [m for m in models if len(_new_names(base, m)) == 1]
+    several = len(_new_names(base, better)) > 1
+    if several:
+        smaller = _chosen(base, singles)
+        if smaller is None or not worth(smaller, better, models):
+            return smaller or better
+    elif better.mean_square < WHITE:
         return better
-    smaller = _chosen(base, [m for m in models if len(_new_names(base, m)) == 1])
-    if smaller is None:
-        return better
-    if not worth(smaller, better, models):
-        return smaller
-    fitted = with_fitted_forms(*sets, smaller, offered)
-    return fitted if fitted is not smaller and as_good(better, fitted) else better
+    fitted = _in_other_forms(sets, base, singles, offered)
+    if several:
+        return next((m for m in fitted if as_good(better, m)), better)
+    own = with_fitted_forms(*sets, better, offered)
+    return min([own, *fitted], key=lambda m: _with_forms_priced(sets[0], m, offered))
+
+
+def _in_other_forms(
+    sets: tuple[Objective, Objective],
+    base: Model,
+    singles: Sequence[Model],
+    offered: Sequence[Unit],
+) -> list[Model]:
+    """Return the best few models of one new effect whose law bends to the data, the best first."""
+    kinds: dict[str, Model] = {}
+    for model in sorted(singles, key=lambda m: criterion(m, 1.0)):
+        if gain(base, model) > needed(base, model) and bendable(sets[0], _beyond(base, model)):
+            kinds.setdefault(_beyond(base, model)[0].name, model)
+    tried = {m: with_fitted_forms(*sets, m, offered) for m in [*kinds.values()][:_FORMS]}
+    fitted = [bent for plain, bent in tried.items() if bent is not plain]
+    return sorted(fitted, key=lambda m: _with_forms_priced(sets[0], m, offered))
+
+
+def _with_forms_priced(train: Objective, model: Model, offered: Sequence[Unit]) -> float:
+    """Return the criterion, and a price for each number of a law that was fitted."""
+    return criterion(model, 1.0) + fitted_numbers(train, model, offered) * price(model)
 
 
 def _new_names(base: Model, model: Model) -> set[str]:

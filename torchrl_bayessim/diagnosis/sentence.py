@@ -20,6 +20,7 @@ _FORMS = {"frequency": ", {:.3g} Hz", "number": ", {:.3g} per turn or 2π m"}
 _BENT = {
     "hardening": ", hardening by {:.2g} x²", "rise": ", and {:+.2g} of it per unit of speed",
     "softness": ", softness {:.2g}", "bend": ", bent by {:+.2g}",
+    "settling": ", settling at {:.2g} per second",
 }  # fmt: skip
 
 

@@ -19,6 +19,7 @@ __all__ = [
     "Saturation",
 ]
 
+import math
 from collections.abc import Mapping
 
 import torch
@@ -288,11 +289,13 @@ class ActionBias(ActionEffect):
 
 
 class BatterySag(ActionEffect):
-    """The drive weakens with time: ``u (1 − s x (1 + b x))``, ``x = min(t / T, 1.5)``; 0 to 0.6.
+    """The drive weakens with time: ``u (1 − s f(x))``, ``x = min(t / T, 1.5)``; 0 to 0.6.
+
+    ``f(x) = (1 − e^{−b x}) / (1 − e^{−b})``, or ``x`` for ``b = 0``.
 
     Args:
         seconds: ``T``, after which the fraction ``s`` is lost.
-        bend: ``b``; negative where it weakens ever less. A diagnosis fits it.
+        bend: ``b``; positive where it weakens ever less. A diagnosis fits it.
     """
 
     name, unit, group, memoryless = "battery_sag", "fraction", "gain", True
@@ -301,9 +304,9 @@ class BatterySag(ActionEffect):
         self.seconds, self.bend = seconds, bend
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
-        """Return the bend, so far that nothing comes back within the runs."""
-        longest = min(max(reach.time, 1e-9) / self.seconds, 1.5)
-        return {"bend": (0.05, -0.5 / longest, 1.0)}
+        """Return the bend."""
+        del reach
+        return {"bend": (0.1, -1.0, 4.0)}
 
     def forms(self, seconds: float) -> tuple[Effect, ...]:
         """Return what is lost within the runs, if they are shorter than ``T``."""
@@ -318,7 +321,9 @@ class BatterySag(ActionEffect):
     ) -> tuple[Tensor, Memory]:
         """Return the command that the battery still supports."""
         spent = (now.time.to(action) / self.seconds).clamp(max=1.5)
-        return action * (1 - strength * spent * (1 + self.bend * spent)), memory
+        if self.bend:
+            spent = torch.expm1(-self.bend * spent) / math.expm1(-self.bend)
+        return action * (1 - strength * spent).clamp(min=0), memory
 
 
 class PacketDrop(ActionEffect):

@@ -17,15 +17,18 @@ __all__ = [
     "SensorQuantization",
 ]
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
-from .effect import Memory, Now, SensorEffect
+from .effect import Memory, Now, Reach, SensorEffect
 from .history import advanced, delayed, empty_line, filled, read_line
 from .laws import decay, quantized, within
 from .robot import Robot
 
 _LONGEST = 8  # control steps that a delay line remembers
+_STEP = 0.05  # of a drift, to see what a change of the law does
 _LEAST = 1e-7  # a uniform number of zero would be infinitely many standard deviations away
 
 
@@ -171,9 +174,23 @@ class SensorLag(SensorEffect):
 
 
 class SensorDrift(SensorEffect):
-    """An offset grows with time: ``x + s t``; up to 10 % of the channel's scale per second."""
+    """An offset grows with time: ``x + s (1 - exp(-k t)) / k``, or ``x + s t`` for ``k = 0``.
+
+    Up to 10 % of the channel's scale per second.
+
+    Args:
+        settling: ``k``, 1/s, as of what warms up. A diagnosis fits it.
+    """
 
     name, unit, group, memoryless = "sensor_drift", "channel/s", "offset", True
+
+    def __init__(self, settling: float = 0.0) -> None:
+        self.settling = settling
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the settling: until it is a constant from nearly the start."""
+        once = 1 / max(reach.time, 1e-9)
+        return {"settling": (_STEP * once, 0.0, 20 * once)}
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return ±10 % of the scale per second."""
@@ -183,11 +200,15 @@ class SensorDrift(SensorEffect):
         self, reading: Tensor, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Tensor, Memory]:
         """Return the drifted values."""
-        return reading + strength * now.time.to(reading), memory
+        return reading + strength * self._spent(now.time.to(reading)), memory
 
     def restore(self, measured: Tensor, strength: Tensor, now: Now) -> Tensor:
         """Return the values without the drift."""
-        return measured - strength.unsqueeze(-2) * now.time.to(measured)
+        return measured - strength.unsqueeze(-2) * self._spent(now.time.to(measured))
+
+    def _spent(self, time: Tensor) -> Tensor:
+        """Return how long it would have drifted steadily to where it is, s."""
+        return time if not self.settling else -torch.expm1(-self.settling * time) / self.settling
 
 
 class SensorDropout(SensorEffect):
