@@ -114,6 +114,30 @@ def test_missing_logs_are_named(tmp_path, write, pendulum):
         read_logs([], pendulum)
 
 
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("run.csv.gz", "unpack run.csv.gz first"),
+        ("run.txt", "by commas and call it run.csv"),
+        ("run.mat", "write columns with a header"),
+    ],
+)
+def test_files_of_other_kinds_are_refused_with_how_to_convert_them(tmp_path, name, hint, pendulum):
+    (tmp_path / name).write_bytes(b"\x1f\x8b")
+    with pytest.raises(
+        ValueError, match=rf"a folder with CSV .* Available: {name}\. Try: .*{hint}"
+    ):
+        read_logs(tmp_path, pendulum)
+    with pytest.raises(ValueError, match=rf"a \.csv or \.parquet file.* Try: .*{hint}"):
+        read_logs(tmp_path / name, pendulum)
+
+
+@pytest.mark.parametrize("first", ["# of 3 May\n", "# "], ids=["a comment", "before the names"])
+def test_a_line_that_begins_with_a_number_sign_is_no_header(first, write, pendulum):
+    with pytest.raises(ValueError, match="Try: a first line with the names alone, without #"):
+        read_logs(write(first + ROWS), pendulum)
+
+
 def test_rows_that_are_not_finite_split_a_log(write, pendulum):
     rows = [f"{0.01 * i:.2f},{0.1 * i},0,{'' if i == 4 else 1},7" for i in range(10)]
     logs = read_logs(write("t,q,qd,tau,note\n" + "\n".join(rows)), pendulum)

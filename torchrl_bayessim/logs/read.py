@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tensordict import TensorDictBase
 
-from ..errors import message
+from ..errors import message, printable
 from ..kinds import check_kind
 from .log import Log
 from .record import Record, record_of
@@ -20,6 +20,8 @@ from .tables import Table, dataset_tables, read_csv, read_parquet, tensordict_ta
 
 Source = str | Path | Sequence[str | Path] | TensorDictBase
 _READERS = {".csv": read_csv, ".parquet": read_parquet}
+_PACKED = {".gz", ".zip", ".xz", ".bz2", ".zst", ".7z", ".tar"}
+_TEXT = {".txt", ".tsv", ".dat", ".log"}
 
 
 def read_records(source: Source, system: System) -> list[Record]:
@@ -93,7 +95,9 @@ def _tables(path: Path, system: System) -> list[Table]:
     if (path / "meta.json").is_file():
         return tensordict_tables(path, system)
     expected = "a folder with CSV or Parquet files, a Minari dataset or a saved TensorDict"
-    raise ValueError(message(expected, str(path)))
+    others = sorted(file for file in path.iterdir() if file.is_file())
+    hint = _conversion(others[0]) if others else ""
+    raise ValueError(message(expected, str(path), available=[o.name for o in others], hint=hint))
 
 
 def _files(paths: Sequence[Path], system: System) -> list[Table]:
@@ -112,9 +116,19 @@ def _files(paths: Sequence[Path], system: System) -> list[Table]:
 def _file_table(path: Path, system: System) -> Table:
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise ValueError(message("a .csv or .parquet file", str(path)))
+        raise ValueError(message("a .csv or .parquet file", str(path), hint=_conversion(path)))
     if not path.is_file():
         raise ValueError(message("a file that exists", str(path)))
     if not path.name.isprintable():  # findings name it, a line each
         raise ValueError(message("a file name of printable letters", path.name))
     return reader(path, system.columns.used())
+
+
+def _conversion(path: Path) -> str:
+    """Return how a file of another kind becomes one that can be read."""
+    suffix, name, stem = (printable(part) for part in (path.suffix.lower(), path.name, path.stem))
+    if suffix in _PACKED:
+        return f"unpack {name} first"
+    if suffix in _TEXT:
+        return f"separate the cells of {name} by commas and call it {stem}.csv"
+    return "write columns with a header, as pandas' DataFrame.to_csv(path, index=False) does"

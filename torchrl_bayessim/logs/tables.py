@@ -343,7 +343,9 @@ def _check_names(names: list[str], header: list[str], file: str) -> None:
     for name in names:
         if name not in header:
             hint = "name it under columns in system.yaml"
-            if len(header) == 1:
+            if header and header[0].startswith("#"):
+                hint = "a first line with the names alone, without # and comments above it"
+            elif len(header) == 1:
                 hint = "separate cells by commas"
             expected = f"a column of {file}"
             raise ValueError(message(expected, name, available=header, hint=hint))
