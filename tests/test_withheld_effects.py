@@ -383,6 +383,20 @@ def test_detectability_is_nothing_without_a_cause_and_grows_with_it():
     assert some.detectability > 100
 
 
+@pytest.mark.parametrize(("robot", "least", "most"), [("arm", 0.95, 1.01), ("hopper", 0.0, 0.9)])
+def test_where_contacts_amplify_noise_a_cause_is_less_visible_than_derivatives_say(
+    robot, least, most, monkeypatch
+):
+    from withheld import detectability
+    from withheld.cases import Plan, make
+
+    plan = Plan("T1", robot, ("com_shift" if robot == "hopper" else "coulomb_friction",))
+    seen = make(plan, np.random.default_rng(5)).detectability
+    ones = lambda predict, whiten, x, **_: np.ones(len(x))
+    monkeypatch.setattr(detectability, "_excess", ones)
+    assert least < seen / make(plan, np.random.default_rng(5)).detectability < most
+
+
 def test_a_pair_is_as_visible_as_the_less_visible_of_its_causes(monkeypatch):
     from withheld import cases
 

@@ -32,6 +32,7 @@ EQUIVALENT = (
     ("action_gain", "armature"),
     ("viscous_friction", "torque_speed_limit"),  # back-EMF is linear in speed
     ("gravity_tilt", "com_shift"),  # of one joint: a centre of mass at another angle
+    ("sensor_bias", "com_shift"),  # of one joint: with its zero elsewhere gravity seems turned
     ("action_bias", "directional_friction"),  # half of it is a constant
     ("parallel_spring", "gravity_tilt"),  # at small angles, beside the mass
     ("parallel_spring", "payload"),  # at small angles: more weight is a stiffer pendulum

@@ -8,13 +8,15 @@ out::
     lambda = || (I - Q Q') L^-1 r ||²,    C = L L',    Q = orth(L^-1 dr/dtheta)
 
 It is the non-centrality of the best test between the cause and none, in all trajectories together.
+About contacts the covariance by derivatives is too small: there ``C`` of a segment is as many times
+larger as draws of the noise, of measurements and initial state, exceed it without any cause.
 """
 
 from __future__ import annotations
 
 __all__ = ["detectability"]
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -25,6 +27,7 @@ from .plant import Motion
 from .robots import entry_value, write_entry
 
 Array = NDArray[np.float64]
+_DRAWS = 16  # of the noise
 _UNKNOWN = 100.0  # 1/s, noise of a velocity that is not measured per noise of its position
 
 
@@ -76,17 +79,42 @@ def detectability(
         flat = residual.reshape(len(x), -1, 1)
         return np.linalg.solve(factor, flat).reshape(-1)
 
-    r = whiten(y[..., measured] - base)
+    scale = np.repeat(_excess(predict, whiten, x, noise=(first_noise, noise[measured])), len(floor))
+
+    r = whiten(y[..., measured] - base) / scale
     tangents = []
     for entry in parameters:
         value = entry_value(model, entry)
         write_entry(model, entry, 1.01 * value)
-        tangents.append(whiten(predict(x) - base))
+        tangents.append(whiten(predict(x) - base) / scale)
         write_entry(model, entry, value)
     if tangents:
         q, _ = np.linalg.qr(np.stack(tangents, 1))
         r = r - q @ (q.T @ r)
     return float(r @ r)
+
+
+def _excess(
+    predict: Callable[[Array], Array],
+    whiten: Callable[[Array], Array],
+    x: Array,
+    *,
+    noise: tuple[Array, Array],
+) -> Array:
+    """Return the root mean square of what whitened noise leaves in each segment, at least 1.
+
+    Args:
+        predict: From initial states.
+        whiten: By derivatives.
+        x: Initial states.
+        noise: Standard deviations of these, and of what is measured.
+    """
+    rng, squares, base = np.random.default_rng(0), np.zeros(len(x)), predict(x)
+    for _ in range(_DRAWS):
+        begun = predict(x + rng.normal(size=x.shape) * noise[0])
+        drawn = begun - base + rng.normal(size=base.shape) * noise[1]
+        squares += (whiten(drawn).reshape(len(x), -1) ** 2).mean(1)
+    return np.sqrt(np.maximum(squares / _DRAWS, 1.0))
 
 
 def _rollout(model: mujoco.MjModel, x: Array, u: Array, substeps: int) -> Array:
