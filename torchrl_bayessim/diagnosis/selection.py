@@ -261,13 +261,31 @@ def _in_other_forms(
     offered: Sequence[Unit],
 ) -> list[Model]:
     """Return the best few models of one new effect whose law bends to the data, the best first."""
+    train = sets[0]
     kinds: dict[str, Model] = {}
     for model in sorted(singles, key=lambda m: criterion(m, 1.0)):
-        if gain(base, model) > needed(base, model) and bendable(sets[0], _beyond(base, model)):
+        if gain(base, model) > needed(base, model):
             kinds.setdefault(_beyond(base, model)[0].name, model)
-    tried = {m: with_fitted_forms(*sets, m, offered) for m in [*kinds.values()][:_FORMS]}
+    laws = [u for u in offered if u.name in kinds and bendable(train, [u])]
+    plain = [m for m in kinds.values() if any(u.name == n.name for u in laws for n in m.units)]
+    plain = plain[:_FORMS]
+    softer = [point for m in plain for point in _as_offered(train, m, _beyond(base, m), laws)]
+    plain += judged(*sets, refit(train, softer, iterations=4)) if softer else []
+    tried = {m: with_fitted_forms(*sets, m, offered) for m in plain}
     fitted = [bent for plain, bent in tried.items() if bent is not plain]
     return sorted(fitted, key=lambda m: _with_forms_priced(sets[0], m, offered))
+
+
+def _as_offered(
+    train: Objective, model: Model, added: Sequence[Unit], laws: Sequence[Unit]
+) -> list[Point]:
+    """Return the model with laws that bend in the place of those that were added and do not."""
+    if bendable(train, added):
+        return []
+    there = {(unit.name, unit.where): unit for unit in laws}
+    others = {unit: there.get((unit.name, unit.where), unit) for unit in added}
+    strengths = model.fit.point.strengths
+    return [Point(model.fit.point.z, {others.get(u, u): s for u, s in strengths.items()})]
 
 
 def _with_forms_priced(train: Objective, model: Model, offered: Sequence[Unit]) -> float:
