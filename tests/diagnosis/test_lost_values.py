@@ -64,6 +64,17 @@ def test_a_lag_explains_lost_commands_only_if_it_does_over_long_segments(
     assert _explained(SimpleNamespace(calm=calm), best) is explained
 
 
+def test_lost_commands_are_found_beside_a_drive_that_saturates():
+    arrives = rough(0.1, np.random.default_rng(1))
+    act = lambda u, k: float(np.clip(arrives(u, k), -2.0, 2.0))
+    report = diagnose(system(), None, logs(8, act=act), effects=[*SOME, "saturation"])
+    assert {effect.name for effect in report.effects} == {"saturation", "packet_drop"}
+    strengths = {effect.name: effect.strength for effect in report.effects}
+    assert strengths["saturation"] == pytest.approx(0.5, rel=0.1)
+    assert strengths["packet_drop"] == pytest.approx(0.1, rel=0.5)
+    assert report.gap.with_effects < 1.3
+
+
 @pytest.mark.parametrize("share", [0.02, 0.1])
 def test_rare_losses_of_commands_are_counted(share):
     act = rough(share, np.random.default_rng(1))
