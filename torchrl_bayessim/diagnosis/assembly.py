@@ -6,7 +6,7 @@ __all__ = ["assemble"]
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
+from .acting import acting_regime
 from .candidates import candidates, concluded
 from .confusion import settled
 from .credit import credit_of, unit_credit, worthwhile
@@ -243,6 +244,10 @@ def _locations(
         return (train, _raw(train, point)), (judged, _raw(judged, point))
 
     before = location(*left(selection.nominal), selection.screens[0], found, confused=confused)
+    if credit:
+        first = max(credit, key=credit.__getitem__)
+        if rules := acting_regime(prepared, selection.best.fit.point, first):
+            before["regimes"] = [asdict(rule) for rule in rules]
     after = location(*left(selection.best), selection.screens[-1], {})
     return before, after
 

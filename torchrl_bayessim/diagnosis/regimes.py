@@ -8,7 +8,7 @@ Imbens 2016 call this honest).
 
 from __future__ import annotations
 
-__all__ = ["Regime", "features", "regimes"]
+__all__ = ["Regime", "features", "regimes", "worded"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -77,14 +77,14 @@ def regimes(
         support = float(rows.mean())
         share = float(np.maximum(counted[1], 0.0)[rows].sum() / total)
         if 0.0 < support < 1.0 and share > 1.3 * support:
-            found.append(Regime(_worded(rule), support, share))
+            found.append(Regime(worded(rule), support, share))
     return sorted(found, key=lambda regime: -regime.share)
 
 
-def _worded(cuts: Sequence[_Cut]) -> str:
+def worded(cuts: Sequence[_Cut]) -> str:
     """Return cuts in words; of several on one side of a feature the last holds, which is nearest.
 
-    >>> _worded([("time", "<", 1.68), ("|v|", ">=", 0.2), ("time", "<", 1.36)])
+    >>> worded([("time", "<", 1.68), ("|v|", ">=", 0.2), ("time", "<", 1.36)])
     'time < 1.36 & |v| >= 0.2'
     """
     last = {(name, sign): cut for name, sign, cut in cuts}
