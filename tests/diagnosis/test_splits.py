@@ -41,7 +41,7 @@ def test_what_shows_in_two_training_runs_alone_is_dealt_to_both_splits():
 
 @pytest.mark.parametrize(
     ("train", "validation"),
-    [([9.0, 8.0, 9.0, 7.0], [5.0, 4.0]), ([30.0, 1.0, 1.0, 1.0], [1.0, 1.0])],
+    [([90.0, 8.0, 9.0, 7.0], [1.0, 1.6]), ([30.0, 1.0, 1.0, 1.0], [1.0, 1.0])],
     ids=["shows in both", "shows in one run"],
 )
 def test_runs_stay_where_both_splits_show_a_gap_or_only_one_run_has_it(train, validation):
@@ -77,12 +77,10 @@ def test_a_cause_that_shows_in_two_training_runs_only_is_found():
     assert {"run0", "run3"} & {*report.audit["validation"]}
 
 
-def test_where_two_runs_only_have_a_spring_and_nothing_is_found_an_alarm_names_them():
+@pytest.mark.parametrize("stiffness", [2.0, 8.0])
+def test_a_spring_in_two_of_eight_runs_is_a_gap_that_no_cause_explains(stiffness):
     """Wide runs with it, wide runs without it: no one strength explains both."""
-    free, bound = rides(), rides(lambda t, q: -8.0 * q)
+    free, bound = rides(), rides(lambda t, q: -stiffness * q)
     logs = [bound[i] if i in {2, 3} else free[i] for i in range(8)]
     report = diagnose(cart(), None, logs, effects=["parallel_spring", "coulomb_friction"])
-    assert report.verdict != "named"
-    about = next(alarm for alarm in report.alarms if "did something happen in" in alarm)
-    assert "run2" in about
-    assert "run3" in about
+    assert report.verdict == "unknown"

@@ -51,6 +51,7 @@ _NUDGE = 0.2  # of the largest command
 _NEEDED, _LIKELY = 40.0, 6.0
 _EXPLAINED = 0.5  # of the excess of the segments concerned, by what is left of them
 _NOISE = 1.2  # scatter that noise has
+_STANDS_OUT = 1.0  # excess of segments with lost commands, to be found beside an effect
 _BIASED = 0.1  # of the excess of the segments concerned, which parameters leave in all
 _LEFT = 2.0  # mean squared innovation of what has not explained the losses
 _OTHERS = 1 / 6  # of the segments that something else may have spoiled
@@ -201,7 +202,8 @@ def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> l
     # what the best explanation without chance gains by the same standard
     found, least = _all_found(nominal, some, alone), sum(alone.costs) - sum(rival.costs)
     if selection.best.units and _apart(selection.best.units):
-        beside = [replace(one, beside=True) for one in _all_found(best, some, rival)]
+        others = _all_found(best, some, rival, beside=True)
+        beside = [replace(one, beside=True) for one in others]
         if _most(beside) > _most(found) - least + _NEEDED:
             found, least = beside, 0.0
     kept = [one for one in found if one.gain > max(_NEEDED, least)]
@@ -236,8 +238,10 @@ def _apart(others: Sequence[Unit]) -> bool:
     return not alike and not any(isinstance(e, ContactFriction) for e in known)
 
 
-def _all_found(data: Mapping[str, _Data], units: Sequence[Unit], alone: _Alone) -> list[Chance]:
-    found = [_found(data, unit, alone) for unit in units]
+def _all_found(
+    data: Mapping[str, _Data], units: Sequence[Unit], alone: _Alone, *, beside: bool = False
+) -> list[Chance]:
+    found = [_found(data, unit, alone, beside=beside) for unit in units]
     return [one for one in found if one is not None]
 
 
@@ -304,8 +308,12 @@ def _cut(prepared: Prepared) -> dict[str, _Data]:
     return found
 
 
-def _found(data: Mapping[str, _Data], unit: Unit, alone: _Alone) -> Chance | None:
-    """Return the losses of a unit, nothing if they do not explain what they spoil."""
+def _found(data: Mapping[str, _Data], unit: Unit, alone: _Alone, *, beside: bool) -> Chance | None:
+    """Return the losses of a unit, nothing if they do not explain what they spoil.
+
+    Commands beside an effect have to stand out: a force law that is not quite the true one errs
+    everywhere a little, as if ever so many of them were lost.
+    """
     tried, base = {name: one.tried(unit) for name, one in data.items()}, alone.law
     judged = [tried[name] for name in _JUDGED]
     scatters = [s for s in _SCATTER.tolist() if s <= base.scatter][-3:]
@@ -324,6 +332,9 @@ def _found(data: Mapping[str, _Data], unit: Unit, alone: _Alone) -> Chance | Non
     if law.scatter > noise or _spoiled(known) > max(_OTHERS, _REMAIN * alone.spoiled):
         return None  # something else is wrong everywhere, and may look like this
     if excess[1] > _EXPLAINED * excess[0]:
+        return None
+    faint = law.share > unit.high or excess[0] < _STANDS_OUT
+    if beside and isinstance(unit.effect, PacketDrop) and faint:
         return None
     share, low, high = np.minimum(law.share_within(judged), unit.high)
     shown = told["test"]

@@ -24,7 +24,6 @@ _AS_LONG = 1.25  # ratio of two lengths that count as one
 _APART = 3  # runs from which each split has one of its own
 _DEAL = "train", "test", "validation", "train", "train", "test", "validation", "train"
 _AGAIN = "train", "validation", "train"
-_UNEVEN = 4.0  # times what is missing in the other split
 _SHOWS = 1.5  # mean squared innovation of a log in which something is missing
 
 
@@ -82,20 +81,19 @@ def dealt_anew(
 ) -> Mapping[str, list[Log]]:
     """Return the same with training and validation logs exchanged, where that is called for.
 
-    Where what is missing shows in a log or two, as friction that matters only in the widest motion,
-    and these are all in one of the two splits, the other cannot judge what explains them. Then
-    both are dealt anew, from the log in which most is missing to the least; pieces of logs train,
-    as ever, and test logs stay.
+    Where what is missing shows in two logs or more, as friction that matters only in the widest
+    motion, and all of them are in one of the two splits, the other cannot judge what explains them.
+    Then both are dealt anew, from the log in which most is missing to the least; pieces of logs
+    train, as ever, and test logs stay.
 
     Args:
         parts: The logs of each split.
         left: Mean squared innovations with parameters alone, of each log of the two splits.
     """
-    missing = {name: np.maximum(left[name] - 1.0, 0.0) for name in ("train", "validation")}
-    least, most = sorted(float(excess.mean()) for excess in missing.values())
-    every = np.concatenate([left["train"], left["validation"]])
-    if most < _UNEVEN * least or (every > _SHOWS).sum() < 2:
+    shows = {name: int((left[name] > _SHOWS).sum()) for name in ("train", "validation")}
+    if min(shows.values()) or max(shows.values()) < 2:
         return parts
+    every = np.concatenate([left["train"], left["validation"]])
     logs = [*parts["train"], *parts["validation"]]
     whole, pieces = _whole([logs[at] for at in np.argsort(-every, kind="stable")])
     again: dict[str, list[Log]] = {"train": [], "validation": []}
