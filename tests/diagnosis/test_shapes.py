@@ -23,3 +23,16 @@ def test_magnets_along_a_rail_are_found_at_their_distance():
     assert report.effects[0].where == "rail"
     (found,) = report.strengths
     assert found.number == pytest.approx(31.0, rel=0.02)
+
+
+def test_a_force_that_shakes_faster_than_segments_follow_each_other_is_no_slower_one():
+    """Segments of 60 ms: 9.9 Hz looks like 6.8 Hz in every one of them."""
+    rng = np.random.default_rng(3)
+    options = {"noise": [0.0005, 0.01], "finer": 4}
+    shaking = lambda time, position: 0.9 * np.sin(2 * np.pi * 9.9 * time + 0.5)
+    logs = [ride(rng, 200, shaking, **options) for _ in range(6)]
+    report = diagnose(cart(), None, logs, effects=SOME)
+    assert [effect.name for effect in report.effects] == ["periodic_disturbance"]
+    (found,) = report.strengths
+    assert found.frequency == pytest.approx(9.9, rel=5e-3)
+    assert report.effects[0].strength == pytest.approx(0.9, rel=0.1)

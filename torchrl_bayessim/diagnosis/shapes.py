@@ -3,9 +3,10 @@
 A periodic disturbance ``s sin(2πft + φ)`` and cogging ``s sin(kq + φ)`` each have two numbers
 beside their strength, which no screen at fixed values can find. Over a few steps a missing force is
 nearly constant, so its course is estimated first, one value per short segment and joint, and the
-best sine over time and over position is fitted to it. So is what rounding the recorded commands
-would have taken away or added, since signatures of two steps that differ a little have nothing in
-common.
+best sine over time and over position is fitted to it. Segments begin at every half of their length,
+so that a fast sine is not taken for a slow one which is the same in every segment. So is fitted
+what rounding the recorded commands would have taken away or added, since signatures of two steps
+that differ a little have nothing in common.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from .objective import Objective, Point, Unit, parameters_at, units_of
 from .prediction import Predictor
 from .screening import LEVELS
 from .segments import cut
+from .splits import stretch
 from .whitening import whitening
 
 Array = NDArray[np.float64]
@@ -37,6 +39,7 @@ _STEPS = 6  # control steps over which a force is taken to be constant
 _BEFORE = 8  # control steps that effects remember
 _MOST = 400  # segments
 _SLOWEST = 0.5  # cycles per log: slower ones are trends
+_FASTEST = 0.75  # cycles per segment, of which the mean is a third of the largest force
 _NUMBERS = np.arange(2.0, 25.0)  # cogs per turn; one is gravity's
 _CLEAR = 0.1  # share of the force's variance that a sine or a step must explain
 _FINEST, _GRID = 0.02, 600  # of the largest step that is plausible; steps tried
@@ -58,26 +61,35 @@ def shaped(
     logs = [log for log in logs if len(log) > max(2 * _STEPS, history + _STEPS)]
     if not pushes or not logs:
         return []
-    system = predictor.system
-    pieces = cut(logs, _STEPS, history=history, most=_MOST)
-    white = whitening(predictor, pieces, parameters_at(system.prior, point.z), noise)
-    objective = Objective(predictor, system.prior, pieces, white)
-    force = missing_force(objective, point, pushes)
-    middle = pieces.history + _STEPS // 2
-    time, spacing = pieces.time[:, middle], _STEPS * system.control_dt
+    system, half = predictor.system, _STEPS // 2
+    shifted = [stretch(log, half, len(log)) for log in logs]
+    shifted = [log for log in shifted if len(log) > history + _STEPS]
+    sets = [logs, shifted] if shifted else [logs]
+    seen = [cut(some, _STEPS, history=history, most=_MOST // 2) for some in sets if some]
+    missing = []
+    for pieces in seen:
+        white = whitening(predictor, pieces, parameters_at(system.prior, point.z), noise)
+        objective = Objective(predictor, system.prior, pieces, white)
+        missing.append(missing_force(objective, point, pushes))
+    force = np.concatenate(missing)
+    at = seen[0].history
+    window, middle = slice(at, at + _STEPS), at + half
+    time = np.concatenate([pieces.time[:, middle] for pieces in seen])
+    qpos = np.concatenate([pieces.qpos[:, window] for pieces in seen])
+    ctrl = np.concatenate([pieces.ctrl[:, window] for pieces in seen])
     span = float(np.mean([len(log) for log in logs])) * system.control_dt
-    frequencies = np.arange(_SLOWEST / span, 0.5 / spacing, 0.125 / span)
-    window = slice(pieces.history, pieces.history + _STEPS)
+    fastest = _FASTEST / (_STEPS * system.control_dt)
+    frequencies = np.arange(_SLOWEST / span, fastest, 0.125 / span)
     units: list[Unit] = []
     for i, push in enumerate(pushes):
         joint = push.joint(system.robot)
-        positions = pieces.qpos[:, window, system.robot.qpos_index[joint]]
+        positions = qpos[..., system.robot.qpos_index[joint]]
         found: list[Effect] = []
         best = _sine(force[:, i], 2 * np.pi * time, frequencies)
         if best is not None:
             found.append(PeriodicDisturbance(frequency=best[0], phase=best[1]))
         rates = _waves(positions) if slides(system.robot, joint) else _NUMBERS
-        best = _sine(force[:, i], positions[:, _STEPS // 2], rates)
+        best = _sine(force[:, i], positions[:, half], rates)
         if best is not None:
             found.append(Cogging(number=best[0], phase=best[1]))
         units += [u for u in units_of(found, system.robot) if u.where == push.where]
@@ -86,7 +98,7 @@ def shaped(
         column = next((i for i, p in enumerate(pushes) if p.joint(system.robot) == joint), None)
         if joint < 0 or column is None or unit.where == "all":
             continue
-        step = _rounding(force[:, column], pieces.ctrl[:, window, actuator], unit.high)
+        step = _rounding(force[:, column], ctrl[..., actuator], unit.high)
         if step is not None:  # the screen's higher level is the step itself
             units.append(replace(unit, high=step / LEVELS[-1]))
     return units

@@ -6,7 +6,7 @@ the validation logs too, and the test logs are opened once, for the figures that
 
 from __future__ import annotations
 
-__all__ = ["dealt_anew", "few", "split"]
+__all__ = ["dealt_anew", "few", "split", "stretch"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -44,7 +44,7 @@ def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
         for log in whole:
             ends = 0, len(log) // 2, 3 * len(log) // 4, len(log)
             for name, (begin, end) in zip(parts, pairwise(ends), strict=True):
-                parts[name].append(_rows(log, begin, end))
+                parts[name].append(stretch(log, begin, end))
     parts["train"] += pieces
     return parts
 
@@ -63,11 +63,18 @@ def _ordered(logs: Sequence[Log]) -> list[Log]:
     return [logs[at] for at in np.lexsort((-width, -length))]
 
 
-def _rows(log: Log, begin: int, end: int) -> Log:
+def stretch(log: Log, begin: int, end: int) -> Log:
+    """Return some rows of a log, the last of which is before ``end``."""
     part = slice(begin, end)
     arrays = {n: getattr(log, n)[part] for n in ("time", "qpos", "qvel", "ctrl")}
+    if log.uncertainty is not None:
+        arrays["uncertainty"] = log.uncertainty[part]
     return replace(
-        log, name=f"{log.name} [{begin}:{end}]", first_row=log.first_row + begin, **arrays
+        log,
+        name=f"{log.name} [{begin}:{end}]",
+        first_row=log.first_row + begin,
+        touching=None if log.touching is None else log.touching.take(np.arange(begin, end)),
+        **arrays,
     )
 
 
