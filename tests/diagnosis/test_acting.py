@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from test_diagnose import logs, system
 
-from torchrl_bayessim.diagnosis.acting import _best_cuts
+from torchrl_bayessim.diagnosis.acting import _best_cuts, acting_regime
 from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.objective import Point, units_of
+from torchrl_bayessim.diagnosis.preparation import prepare
+from torchrl_bayessim.effects.action import Saturation
+from torchrl_bayessim.effects.sensors import SensorGain
 
 
 def rule(report):
@@ -28,18 +32,41 @@ def test_a_drive_that_saturates_acts_where_commands_are_larger_than_it_gives():
     assert share > 0.85
 
 
-def test_what_is_found_at_a_sensor_has_no_rule_of_its_own():
-    late = logs()
-    turned = [type(log)(**{**log.__dict__, "qpos": log.qpos + 0.1}) for log in late]
-    report = diagnose(system(), None, turned, effects=["sensor_bias"])
-    assert [effect.name for effect in report.effects] == ["sensor_bias"]
-    for regime in report.where["regimes"]:
-        assert regime["share"] < 1.0
+@pytest.fixture(scope="module")
+def prepared():
+    robot = system()
+    units = units_of([Saturation(), SensorGain()], robot.robot)
+    rng = np.random.default_rng(0)
+    return prepare(robot, logs(), units, generator=rng), {str(u): u for u in units}
 
 
-def test_a_cause_that_acts_in_every_step_has_no_rule():
-    columns = {"v": np.linspace(-1.0, 1.0, 400)}
-    assert _best_cuts(columns, np.ones(400, dtype=bool)) == ()
+@pytest.mark.parametrize(
+    ("unit", "strength", "rules"),
+    [
+        ("saturation[motor]", 0.5, 1),  # of commands beyond 2
+        ("saturation[motor]", 0.0, 0),
+        ("sensor_gain[hinge velocity]", 0.1, 0),  # at speed, but of sensors nothing is said
+    ],
+)
+def test_commands_have_a_rule_and_sensors_have_none(unit, strength, rules, prepared):
+    known, units = prepared
+    point = Point(known.nominal.point.z, {units[unit]: strength})
+    assert len(acting_regime(known, point, units[unit].name)) == rules
+
+
+def test_a_cause_that_acts_in_nearly_every_step_has_no_rule(prepared, monkeypatch):
+    known, units = prepared
+    unit = units["saturation[motor]"]
+    point = Point(known.nominal.point.z, {unit: 0.5})
+
+    def nearly_always(prepared, steps, point, name):
+        speed = steps.qvel[:, steps.history, 0]
+        return (speed > np.quantile(speed, 0.2)).astype(float)
+
+    monkeypatch.setattr("torchrl_bayessim.diagnosis.acting.change", nearly_always)
+    assert len(acting_regime(known, point, unit.name)) == 1
+    monkeypatch.setattr("torchrl_bayessim.diagnosis.acting._EVERYWHERE", 0.75)
+    assert acting_regime(known, point, unit.name) == []
 
 
 def test_a_rule_is_no_longer_than_it_need_be():

@@ -1,5 +1,7 @@
 """What a law has beside its strength is fitted once the effect is in the model."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -7,6 +9,14 @@ from rail_cart import cart, ride
 from test_diagnose import ARM, logs
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.form_fit import _nearest_offered, _Shift, with_forms_anew
+from torchrl_bayessim.diagnosis.model import judged
+from torchrl_bayessim.diagnosis.objective import Point, Unit, units_of
+from torchrl_bayessim.diagnosis.preparation import prepare
+from torchrl_bayessim.diagnosis.refit import refit
+from torchrl_bayessim.effects.action import Saturation
+from torchrl_bayessim.effects.sensors import SensorDrift
+from torchrl_bayessim.effects.transmission import ServoGain
 from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.logs.system import System
 
@@ -90,3 +100,34 @@ def test_one_gain_that_bends_is_named_and_not_two_effects_that_imitate_it():
     assert report.effects[0].strength == pytest.approx(0.3, rel=0.1)
     (found,) = report.strengths
     assert found.bend == pytest.approx(-0.5, abs=0.1)
+
+
+def test_a_drift_that_was_taken_to_settle_is_steady_again():
+    """A number that comes back to where it was offered is no reason to give up what was gained."""
+    rng = np.random.default_rng(0)
+    rides = [ride(rng, 200, lambda t, q: 0.0, noise=[0.0005, 0.01]) for _ in range(6)]
+    rides = [replace(r, qpos=r.qpos + 0.05 * r.time[:, None]) for r in rides]
+    steady = next(u for u in units_of([SensorDrift()], cart().robot) if u.where == "rail position")
+    settling = replace(steady, effect=SensorDrift(settling=0.5))
+    known = prepare(cart(), rides, [steady], generator=np.random.default_rng(0))
+    sets = known.sets["train"], known.sets["validation"]
+    point = Point(known.nominal.point.z, {settling: 0.05})
+    (start,) = judged(*sets, refit(sets[0], [point]))
+    again = with_forms_anew(*sets, start, [steady])
+    assert again.fit.cost < start.fit.cost - 20
+    assert [unit.effect.settling for unit in again.units] == [0.0]
+
+
+@pytest.mark.parametrize(
+    ("softness", "expected"), [(0.22, 0.5), (0.9, 0.5)], ids=["nearly hard", "soft"]
+)
+def test_what_is_straightened_is_a_law_that_was_offered_and_can_be_fitted(softness, expected):
+    shift = _Shift(unit_of(Saturation(softness)), "softness", 0.02, 0.1, 1.0)
+    offered = [unit_of(Saturation()), unit_of(Saturation(0.5)), unit_of(ServoGain())]
+    assert _nearest_offered(shift, offered) == expected
+    assert shift.paid(offered)
+    assert not _Shift(unit_of(Saturation(0.5)), "softness", 0.02, 0.1, 1.0).paid(offered)
+
+
+def unit_of(effect):
+    return Unit(effect, "motor", (1.0,), 0.0, 1.0)

@@ -22,6 +22,7 @@ from .divergence import divergence_alarms, diverges_throughout
 from .doubts import alike, baseless, doubts, numerical, unsigned
 from .experiment import experiments
 from .figures import figures
+from .form_fit import with_slopes_of_forms
 from .found import Found
 from .late_rows import late_row_alarms
 from .location import location
@@ -68,7 +69,10 @@ def assemble(
     credit = credit_of(selection)
     if credit:
         selection = settled(selection, max(credit, key=credit.__getitem__), prepared.sets)
-    credit, best = credit_of(selection), selection.best
+    offered = selection.screens[0].units
+    best = with_slopes_of_forms(prepared.sets["train"], selection.best, offered)
+    selection = replace(selection, best=best)
+    credit = credit_of(selection)
     points = _points(selection)
     found = Found.of(prepared, selection, scatter, credit, points=points, generator=generator)
     seen = (
@@ -112,6 +116,11 @@ def assemble(
     if verdict in {"none", "unknown", "not_testable"}:
         # what little was tried is among the candidates
         found = replace(found, effects=(), strengths={}, confused=())
+    elif credit:
+        first = max(credit, key=credit.__getitem__)
+        rules = acting_regime(prepared, best.fit.point, first)
+        if rules:
+            where |= {"regimes": [asdict(rule) for rule in rules], "regimes_of": first}
     names, measured = {effect.name for effect in found.effects}, found.measured
     left = measured.effects if names else measured.refit
     seen = concluded(seen, verdict, names, left=left)
@@ -244,10 +253,6 @@ def _locations(
         return (train, _raw(train, point)), (judged, _raw(judged, point))
 
     before = location(*left(selection.nominal), selection.screens[0], found, confused=confused)
-    if credit:
-        first = max(credit, key=credit.__getitem__)
-        if rules := acting_regime(prepared, selection.best.fit.point, first):
-            before["regimes"] = [asdict(rule) for rule in rules]
     after = location(*left(selection.best), selection.screens[-1], {})
     return before, after
 

@@ -10,10 +10,11 @@ __all__ = ["eliminated", "parts", "without_idle", "without_stopgaps"]
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from .form_fit import bendable, with_forms_anew
+from .form_fit import bendable, priced, with_forms_anew
 from .model import Model, criterion, gain, judged, needed
 from .objective import Objective, Point, Unit
 from .refit import refit
@@ -123,9 +124,10 @@ def without_stopgaps(
             for part in parts(train, validation, model, of=lambda left: bendable(train, left))
             if (fitted := with_forms_anew(train, validation, part, offered)) is not part
         ]
-        limit = criterion(model, model.dispersion())
-        enough = [m for m in smaller if criterion(m, model.dispersion()) < limit]
-        if not enough:
+        dispersion = model.dispersion()
+        cost = partial(priced, train, offered=offered, dispersion=dispersion)
+        best = min([model, *smaller], key=cost)
+        if best is model:
             break
-        model = min(enough, key=lambda one: criterion(one, model.dispersion()))
+        model = best
     return model

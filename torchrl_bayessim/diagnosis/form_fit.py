@@ -9,7 +9,7 @@ from __future__ import annotations
 
 __all__ = [
     "bendable",
-    "fitted_numbers",
+    "priced",
     "with_fitted_forms",
     "with_forms_anew",
     "with_slopes_of_forms",
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..effects.effect import Reach
 from ..effects.units import slides
-from .model import LIKELY, WHITE, Model, judged, price
+from .model import LIKELY, WHITE, Model, criterion, judged, price
 from .objective import Objective, Point, Unit
 from .refit import Fit, refit, with_prior
 
@@ -48,8 +48,12 @@ class _Shift:
         """Return whether the number has been fitted: of a wave, or none that was offered."""
         if not np.isfinite(self.least):
             return True
-        value, alike = _value(self), (u for u in offered if u.name == self.unit.name)
-        return not any(unit.effect.form.get(self.number) == value for unit in alike)
+        return _value(self) not in self.offered(offered)
+
+    def offered(self, units: Collection[Unit]) -> set[float]:
+        """Return the values that it was offered with, of the same law."""
+        alike = (u.effect for u in units if type(u.effect) is type(self.unit.effect))
+        return {float(effect.form[self.number]) for effect in alike}
 
 
 def with_fitted_forms(
@@ -87,9 +91,12 @@ def bendable(train: Objective, units: Iterable[Unit]) -> bool:
     )
 
 
-def fitted_numbers(train: Objective, model: Model, offered: Collection[Unit]) -> int:
-    """Return how many numbers of laws were fitted."""
-    return sum(shift.paid(offered) for shift in _shifts(train, model))
+def priced(
+    train: Objective, model: Model, offered: Collection[Unit], *, dispersion: float = 1.0
+) -> float:
+    """Return the criterion, and a price for each number of a law that was fitted."""
+    count = sum(shift.paid(offered) for shift in _shifts(train, model))
+    return criterion(model, dispersion) + count * price(model)
 
 
 def with_forms_anew(
@@ -112,8 +119,8 @@ def with_forms_anew(
 
 def _nearest_offered(shift: _Shift, offered: Collection[Unit]) -> float:
     """Return the number as it was offered, the nearest where it was with several."""
-    values = {float(u.effect.form[shift.number]) for u in offered if u.name == shift.unit.name}
-    return min(values, key=lambda value: abs(value - _value(shift)))
+    values = [v for v in shift.offered(offered) if shift.least <= v <= shift.most]
+    return min(values, key=lambda value: abs(value - _value(shift)), default=_value(shift))
 
 
 def with_slopes_of_forms(train: Objective, model: Model, offered: Collection[Unit]) -> Model:
@@ -147,7 +154,7 @@ def _fitted(
     for _ in range(_STEPS):
         shifts = [shift for shift in _shifts(train, best) if moves(shift)]
         if not shifts:
-            return model
+            break
         whole, *shorter = _moved(train, best, shifts)
         fitted = refit(train, [whole], iterations=2)[0]
         if fitted.cost >= best.fit.cost:

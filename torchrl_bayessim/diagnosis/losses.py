@@ -7,8 +7,9 @@ losses, where some segments are spoiled by something else: losses have to explai
 and not only that some segments are worse than others. They are looked for in the place of the
 effects that the search found, and beside them.
 
-Effects of commands are linear in them over so few steps, so every pattern is made of one simulation
-per step; those of samples are the simulated values.
+Effects of commands are nearly linear in them over so few steps, so every pattern is made of one
+simulation per step, in which the command of that step is the one before it: of one loss that is
+what happened, whatever the drive does with commands. Those of samples are the simulated values.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ _MOST = {"train": 90, "validation": 45, "test": 45}  # segments
 _SHARES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.25, 0.4, 0.6)  # s
 _SCATTER = np.geomspace(0.5, 4.0, 10)  # φ
 _SPOILED = (0.003, 0.01, 0.03, 0.1, 0.3)  # η
-_NUDGE = 0.2  # of the largest command
+_NUDGE, _SAME = 0.2, 0.01  # of the largest command, and of that: a change that is none
 # deviances: to be found (contacts that come late look like a few losses), and that chance makes
 _NEEDED, _LIKELY = 40.0, 6.0
 _EXPLAINED = 0.5  # of the excess of the segments concerned, by what is left of them
@@ -126,13 +127,16 @@ class _Data:
             return self._known[actuator]
         segments, robot = self.objective.segments, self.objective.predictor.system.robot
         at = segments.history
-        nudge = -_NUDGE * float(robot.command_scale[actuator]) * np.where(sent > 0, 1.0, -1.0)
+        least = _NUDGE * float(robot.command_scale[actuator])
+        nudge = sent[:, :-1] - sent[:, 1:]
+        nudge = np.where(np.abs(nudge) < _SAME * least, -least * np.sign(sent[:, 1:]), nudge)
+        nudge = np.where(nudge == 0, -least, nudge)
         slopes = []
         for t in range(segments.horizon):
             ctrl = segments.ctrl.copy()
-            ctrl[:, at + t, actuator] += nudge[:, 1 + t]
+            ctrl[:, at + t, actuator] += nudge[:, t]
             moved = self.objective.along(replace(segments, ctrl=ctrl))([self.point])[0]
-            slopes.append((moved - self.left) / nudge[:, 1 + t, None])
+            slopes.append((moved - self.left) / nudge[:, t, None])
         self._known[actuator] = np.stack(slopes, -1)
         return self._known[actuator]
 

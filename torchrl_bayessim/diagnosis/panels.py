@@ -112,9 +112,11 @@ def _shares_of(where: Mapping[str, Any], title: str) -> Markup:
               [[e["name"], bar(e["share"])] for e in entries], shown=8)
         for name, entries in groups.items() if any(e["share"] > 0 for e in entries)
     ]  # fmt: skip
+    cause = where.get("regimes_of")
+    part = f"what {plain(cause)} changes" if cause else "the excess"
     rules = [
         element("li", element("code", r["rule"]),
-                f": {percent(r['support'])} of the rows, {percent(r['share'])} of the excess")
+                f": {percent(r['support'])} of the rows, {percent(r['share'])} of {part}")
         for r in where.get("regimes", ())
     ]  # fmt: skip
     told = element("ul", *rules) if rules else element("p", "No regime stands out.")

@@ -148,12 +148,16 @@ def prepare(
 def _by_log(
     parts: Mapping[str, Sequence[Log]], nominal: Fit, sets: Mapping[str, Objective]
 ) -> dict[str, Array]:
-    """Return the mean squared innovation of each training and validation log."""
+    """Return the mean squared innovation of each training and validation log, of every segment.
+
+    Zero for a log that has none.
+    """
     left = {"train": nominal.innovations, "validation": sets["validation"]([nominal.point])[0]}
     found = {}
     for name, innovations in left.items():
         of, count = sets[name].segments.log, len(parts[name])
-        total = np.bincount(of, (innovations**2).mean(-1), minlength=count)
+        plain = innovations / sets[name].whitening.weights[:, None]
+        total = np.bincount(of, (plain**2).mean(-1), minlength=count)
         found[name] = total / np.maximum(np.bincount(of, minlength=count), 1)
     return found
 

@@ -158,7 +158,8 @@ class Report:
         summary: One sentence.
         effects: What was found, largest share first.
         confusion_set: Effects that explain the data as well as the first, itself included.
-        where: Channel, outputs, joints, regimes and time of the error.
+        where: Channel, outputs, joints and time of the error, and the regimes in which the first
+            cause acts (``regimes_of``) or else the error sits.
         remainder: The same for what the effects leave.
         gap: How large it is.
         candidates: Every effect at every place.

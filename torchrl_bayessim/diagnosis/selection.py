@@ -22,13 +22,12 @@ from .elimination import eliminated, without_stopgaps
 from .explanations import bent, compare, explanations
 from .form_fit import (
     bendable,
-    fitted_numbers,
+    priced,
     with_fitted_forms,
     with_forms_anew,
-    with_slopes_of_forms,
 )
 from .further_effects import identified, nothing_left
-from .model import WHITE, Model, as_good, criterion, gain, judged, needed, price
+from .model import WHITE, Model, as_good, criterion, gain, judged, needed
 from .objective import Objective, Point, Unit
 from .refit import Fit, refit
 from .screening import Screen
@@ -111,19 +110,18 @@ def select(
             break
         best = _exactly(train, validation, better)
         best = with_fitted_forms(train, validation, best, offered)
-        units = with_shapes(units, _beyond(better, best))  # in the places of what was off a grid
-        tried += [best] if _beyond(better, best) else []
+        units = _with_forms(units, best)
+        tried += [better, best]
     progress("taking out what is not needed")
     needs, dropped = eliminated(train, validation, best)
     if len(needs.units) < len(best.units):
         needs = with_forms_anew(train, validation, needs, offered)
     needs = without_stopgaps(train, validation, needs, offered)
-    units = with_shapes(units, _beyond(best, needs))
+    units = _with_forms(units, needs)
     tried += [*dropped, needs]
     best, others = _settled(
         train, validation, needs, units=units, tried=tried, first=screens[0], progress=progress
     )
-    best = with_slopes_of_forms(train, best, offered)
     return Selection(start, best, tuple(screens), tuple(p_values), tuple(tried), others)
 
 
@@ -150,6 +148,11 @@ def _settled(
         best, dropped = eliminated(train, validation, _exactly(train, validation, better))
         tried += dropped
     return best, {}
+
+
+def _with_forms(units: Sequence[Unit], model: Model) -> list[Unit]:
+    """Return the units, those of a model with fitted forms in the places of their like."""
+    return with_shapes(units, [unit for unit in model.units if unit not in units])
 
 
 def _beyond(base: Model, model: Model) -> list[Unit]:
@@ -251,7 +254,7 @@ def _fewest(
     if several:
         return next((m for m in fitted if as_good(better, m)), better)
     own = with_fitted_forms(*sets, better, offered)
-    return min([own, *fitted], key=lambda m: _with_forms_priced(sets[0], m, offered))
+    return min([own, *fitted], key=lambda m: priced(sets[0], m, offered))
 
 
 def _in_other_forms(
@@ -267,13 +270,14 @@ def _in_other_forms(
         if gain(base, model) > needed(base, model):
             kinds.setdefault(_beyond(base, model)[0].name, model)
     laws = [u for u in offered if u.name in kinds and bendable(train, [u])]
-    plain = [m for m in kinds.values() if any(u.name == n.name for u in laws for n in m.units)]
+    bends = {unit.name for unit in laws}
+    plain = [m for name, m in kinds.items() if name in bends]
     plain = plain[:_FORMS]
     softer = [point for m in plain for point in _as_offered(train, m, _beyond(base, m), laws)]
     plain += judged(*sets, refit(train, softer, iterations=4)) if softer else []
     tried = {m: with_fitted_forms(*sets, m, offered) for m in plain}
     fitted = [bent for plain, bent in tried.items() if bent is not plain]
-    return sorted(fitted, key=lambda m: _with_forms_priced(sets[0], m, offered))
+    return sorted(fitted, key=lambda m: priced(sets[0], m, offered))
 
 
 def _as_offered(
@@ -285,12 +289,8 @@ def _as_offered(
     there = {(unit.name, unit.where): unit for unit in laws}
     others = {unit: there.get((unit.name, unit.where), unit) for unit in added}
     strengths = model.fit.point.strengths
-    return [Point(model.fit.point.z, {others.get(u, u): s for u, s in strengths.items()})]
-
-
-def _with_forms_priced(train: Objective, model: Model, offered: Sequence[Unit]) -> float:
-    """Return the criterion, and a price for each number of a law that was fitted."""
-    return criterion(model, 1.0) + fitted_numbers(train, model, offered) * price(model)
+    moved = {others.get(u, u): others.get(u, u).inside(s) for u, s in strengths.items()}
+    return [Point(model.fit.point.z, moved)]
 
 
 def _new_names(base: Model, model: Model) -> set[str]:

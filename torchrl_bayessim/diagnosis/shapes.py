@@ -61,22 +61,10 @@ def shaped(
     logs = [log for log in logs if len(log) > max(2 * _STEPS, history + _STEPS)]
     if not pushes or not logs:
         return []
-    system, half = predictor.system, _STEPS // 2
-    shifted = [stretch(log, half, len(log)) for log in logs]
-    shifted = [log for log in shifted if len(log) > history + _STEPS]
-    sets = [logs, shifted] if shifted else [logs]
-    seen = [cut(some, _STEPS, history=history, most=_MOST // 2) for some in sets if some]
-    missing = []
-    for pieces in seen:
-        white = whitening(predictor, pieces, parameters_at(system.prior, point.z), noise)
-        objective = Objective(predictor, system.prior, pieces, white)
-        missing.append(missing_force(objective, point, pushes))
-    force = np.concatenate(missing)
-    at = seen[0].history
-    window, middle = slice(at, at + _STEPS), at + half
-    time = np.concatenate([pieces.time[:, middle] for pieces in seen])
-    qpos = np.concatenate([pieces.qpos[:, window] for pieces in seen])
-    ctrl = np.concatenate([pieces.ctrl[:, window] for pieces in seen])
+    system = predictor.system
+    force, time, qpos, ctrl = _missing(
+        predictor, logs, point=point, noise=noise, pushes=pushes, history=history
+    )
     span = float(np.mean([len(log) for log in logs])) * system.control_dt
     fastest = _FASTEST / (_STEPS * system.control_dt)
     frequencies = np.arange(_SLOWEST / span, fastest, 0.125 / span)
@@ -89,7 +77,7 @@ def shaped(
         if best is not None:
             found.append(PeriodicDisturbance(frequency=best[0], phase=best[1]))
         rates = _waves(positions) if slides(system.robot, joint) else _NUMBERS
-        best = _sine(force[:, i], positions[:, half], rates)
+        best = _sine(force[:, i], positions[:, _STEPS // 2], rates)
         if best is not None:
             found.append(Cogging(number=best[0], phase=best[1]))
         units += [u for u in units_of(found, system.robot) if u.where == push.where]
@@ -102,6 +90,32 @@ def shaped(
         if step is not None:  # the screen's higher level is the step itself
             units.append(replace(unit, high=step / LEVELS[-1]))
     return units
+
+
+def _missing(
+    predictor: Predictor,
+    logs: Sequence[Log],
+    *,
+    point: Point,
+    noise: Array,
+    pushes: Sequence[Unit],
+    history: int,
+) -> tuple[Array, Array, Array, Array]:
+    """Return missing forces ``(S, J)`` of short segments, their times, positions and commands."""
+    half = _STEPS // 2
+    shifted = [stretch(log, half, len(log)) for log in logs]
+    shifted = [log for log in shifted if len(log) > history + _STEPS]
+    forces, seen = [], []
+    for some in [logs, shifted] if shifted else [logs]:
+        pieces = cut(some, _STEPS, history=history, most=_MOST // 2)
+        prior = predictor.system.prior
+        white = whitening(predictor, pieces, parameters_at(prior, point.z), noise)
+        forces.append(missing_force(Objective(predictor, prior, pieces, white), point, pushes))
+        begin = pieces.history
+        window = slice(begin, begin + _STEPS)
+        seen.append((pieces.time[:, begin + half], pieces.qpos[:, window], pieces.ctrl[:, window]))
+    time, qpos, ctrl = (np.concatenate(part) for part in zip(*seen, strict=True))
+    return np.concatenate(forces), time, qpos, ctrl
 
 
 def with_shapes(units: Sequence[Unit], found: Sequence[Unit]) -> list[Unit]:

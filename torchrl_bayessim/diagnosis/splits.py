@@ -102,9 +102,13 @@ def dealt_anew(
         return parts
     every = np.concatenate([left["train"], left["validation"]])
     logs = [*parts["train"], *parts["validation"]]
-    whole, pieces = _whole([logs[at] for at in np.argsort(-every, kind="stable")])
+    pieces = _whole([log for part in parts.values() for log in part])[1]
     again: dict[str, list[Log]] = {"train": [], "validation": []}
+    order = [logs[at] for at in np.argsort(-every, kind="stable")]
+    whole = [log for log in order if not any(log is piece for piece in pieces)]
     for log, name in zip(whole, cycle(_AGAIN), strict=False):
         again[name].append(log)
-    again["train"] += pieces
+    if not again["validation"]:
+        return parts
+    again["train"] += [log for log in order if any(log is piece for piece in pieces)]
     return {**parts, **again}

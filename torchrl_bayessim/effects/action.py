@@ -289,7 +289,7 @@ class ActionBias(ActionEffect):
 
 
 class BatterySag(ActionEffect):
-    """The drive weakens with time: ``u (1 − s f(x))``, ``x = min(t / T, 1.5)``; 0 to 0.6.
+    """The drive weakens with time: ``u max(1 − s f(x), 0)``, ``x = min(t / T, 1.5)``; 0 to 0.6.
 
     ``f(x) = (1 − e^{−b x}) / (1 − e^{−b})``, or ``x`` for ``b = 0``.
 

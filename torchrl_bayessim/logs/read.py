@@ -95,7 +95,8 @@ def _tables(path: Path, system: System) -> list[Table]:
     if (path / "meta.json").is_file():
         return tensordict_tables(path, system)
     expected = "a folder with CSV or Parquet files, a Minari dataset or a saved TensorDict"
-    others = sorted(file for file in path.iterdir() if file.is_file())
+    shown = (file for file in path.iterdir() if not file.name.startswith("."))
+    others = sorted((f for f in shown if f.is_file()), key=lambda f: (_kind(f), f.name))
     hint = _conversion(others[0]) if others else ""
     raise ValueError(message(expected, str(path), available=[o.name for o in others], hint=hint))
 
@@ -116,12 +117,19 @@ def _files(paths: Sequence[Path], system: System) -> list[Table]:
 def _file_table(path: Path, system: System) -> Table:
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise ValueError(message("a .csv or .parquet file", str(path), hint=_conversion(path)))
+        hint = "" if path.is_dir() else _conversion(path)
+        raise ValueError(message("a .csv or .parquet file", str(path), hint=hint))
     if not path.is_file():
         raise ValueError(message("a file that exists", str(path)))
     if not path.name.isprintable():  # findings name it, a line each
         raise ValueError(message("a file name of printable letters", path.name))
     return reader(path, system.columns.used())
+
+
+def _kind(path: Path) -> int:
+    """Return 0 for what is packed, 1 for what is neither packed nor text, 2 for text."""
+    suffix = path.suffix.lower()
+    return 0 if suffix in _PACKED else 2 if suffix in _TEXT else 1
 
 
 def _conversion(path: Path) -> str:

@@ -343,7 +343,11 @@ def _check_names(names: list[str], header: list[str], file: str) -> None:
     for name in names:
         if name not in header:
             hint = "name it under columns in system.yaml"
-            if header and header[0].startswith("#"):
+            if (
+                header
+                and header[0].startswith("#")
+                and (len(header) == 1 or header[0].lstrip("# ") in names)
+            ):
                 hint = "a first line with the names alone, without # and comments above it"
             elif len(header) == 1:
                 hint = "separate cells by commas"
