@@ -10,7 +10,17 @@ from typing import Any
 
 from ..errors import message
 from ..kinds import check_kind
-from . import action, bodies, contacts, disturbance, friction, joints, sensors, transmission
+from . import (
+    action,
+    bodies,
+    compliance,
+    contacts,
+    disturbance,
+    friction,
+    joints,
+    sensors,
+    transmission,
+)
 from .effect import Effect
 
 CATALOGUE = MappingProxyType(
@@ -28,7 +38,7 @@ CATALOGUE = MappingProxyType(
             action.PacketDrop,
             action.ActionJitter,
             action.ActionQuantization,
-            transmission.Backlash,
+            compliance.Backlash,
             joints.CoulombFriction,
             friction.StribeckFriction,
             joints.ViscousFriction,
@@ -36,7 +46,7 @@ CATALOGUE = MappingProxyType(
             friction.LoadDependentFriction,
             friction.DirectionalFriction,
             joints.ParallelSpring,
-            transmission.SeriesElasticity,
+            compliance.SeriesElasticity,
             bodies.GravityTilt,
             disturbance.ConstantForce,
             disturbance.PeriodicDisturbance,

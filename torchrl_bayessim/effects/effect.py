@@ -90,6 +90,10 @@ class Effect(ABC):
         random: Whether it changes the distribution of what is seen rather than its mean.
         memoryless: Whether the law depends on this step only, so that sequences are one call.
         limit: Whether a small strength does nothing to a robot that stays far from the limit.
+        search_power: Searches and fits count strengths by ``(s / s_max)^(1 / power)``: 2 where
+            what shows is a period and ``s`` its square, so that fast ones are told apart too.
+        nuisances: Options of `free` of which no value is the usual one: fitted like strengths, and
+            what is not known of them widens the intervals of strengths in any case.
     """
 
     name: ClassVar[str]
@@ -99,6 +103,8 @@ class Effect(ABC):
     random: ClassVar[bool] = False
     memoryless: ClassVar[bool] = False
     limit: ClassVar[bool] = False
+    search_power: ClassVar[float] = 1.0
+    nuisances: ClassVar[tuple[str, ...]] = ()
 
     def __eq__(self, other: object) -> bool:
         """Return whether the other is the same law with the same options."""

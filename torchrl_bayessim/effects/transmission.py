@@ -1,4 +1,4 @@
-"""What lies between motor and joint: a speed limit, a gap, a spring, at every time step.
+"""What a drive does to the force of its motor, at every time step: a speed limit, a servo's laws.
 
 Each changes the force ``F`` that an actuator exerts to another, ``F'``, by way of the command that
 exerts it, ``u' = u + (F' − F) / g`` for the force per unit of command ``g``: so it works for motors
@@ -8,23 +8,23 @@ and for servos alike. Strengths are per actuator.
 from __future__ import annotations
 
 __all__ = [
-    "Backlash",
-    "SeriesElasticity",
     "ServoDeadBand",
+    "ServoGain",
     "TorqueSpeedLimit",
+    "TransmissionEffect",
+    "at_actuators",
+    "change",
     "driven",
     "servo_damping",
     "servos",
 ]
 
-import math
 from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 from .effect import ForceEffect, Memory, Now, Reach
-from .history import filled
 from .robot import Robot
 
 
@@ -53,7 +53,9 @@ def servos(robot: Robot) -> list[int]:
     return [] if model is None else [i for i in driven(robot) if model.actuator_biasprm[i, 1] != 0]
 
 
-class _Transmission(ForceEffect):
+class TransmissionEffect(ForceEffect):
+    """Acts on the force of actuators."""
+
     channel = "actuation"
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
@@ -65,19 +67,19 @@ class _Transmission(ForceEffect):
         return robot.joint_of_actuator[target]
 
 
-def _at_actuators(values: Tensor, robot: Robot) -> Tensor:
+def at_actuators(values: Tensor, robot: Robot) -> Tensor:
     """Return values of joints for the actuators that move them."""
     return values[list(robot.joint_of_actuator)]
 
 
-def _change(force: Tensor, now: Now) -> Mapping[str, Tensor]:
+def change(force: Tensor, now: Now) -> Mapping[str, Tensor]:
     """Return the change of commands under which actuators exert ``force``, within their limits."""
     # of a command that is beyond its limits, all that is beyond has to go first
-    change = (force - now.demanded_force) / now.actuator_gain
-    return {"command": torch.where(force == now.actuator_force, 0.0, change)}
+    missing = (force - now.demanded_force) / now.actuator_gain
+    return {"command": torch.where(force == now.actuator_force, 0.0, missing)}
 
 
-class TorqueSpeedLimit(_Transmission):
+class TorqueSpeedLimit(TransmissionEffect):
     """A motor loses torque with speed: ``|F| ≤ F_max clip(1.2 − s |v| / v_max, 0.05, 1)``.
 
     Where it drives (``F v > 0``); ``F_max`` is the actuator's largest force and ``v_max`` the
@@ -114,10 +116,10 @@ class TorqueSpeedLimit(_Transmission):
         share = (1.2 - (strength * speed.abs()) ** self.power).clamp(0.05, 1.0)
         limited = now.actuator_force.clamp(-share * largest, share * largest)
         drives = (share < 1) & (now.actuator_force * speed > 0)
-        return _change(torch.where(drives, limited, now.actuator_force), now), memory
+        return change(torch.where(drives, limited, now.actuator_force), now), memory
 
 
-class _OfServos(_Transmission):
+class _OfServos(TransmissionEffect):
     """What acts on the force of servos, with the part that is their damping or without it."""
 
     damped: bool
@@ -201,94 +203,3 @@ def servo_damping(robot: Robot) -> Tensor:
     """Return the force of each actuator per unit of its velocity."""
     model = robot.require_model()
     return torch.from_numpy(model.actuator_biasprm[:, 2] * (model.actuator_biastype != 0))
-
-
-class Backlash(_Transmission):
-    """A gap of width ``s``: no force passes until the motor has crossed it.
-
-    The motor's place in the gap ``β ∈ [−s/2, s/2]`` follows ``β̇ = v_max F / F_max``, the speed at
-    which it leaves the joint while nothing holds it; force passes at the side that it pushes. In
-    rad or m of the joint, up to 0.1 (6°).
-    """
-
-    name, unit, group = "backlash", "rad", "elasticity"
-
-    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
-        """Return 0 and a tenth of a radian or of the joint's range."""
-        wide = 0.1 * _at_actuators(robot.position_scale, robot).clamp(max=1.0)
-        return torch.zeros_like(wide), wide
-
-    def start(self, velocity: Tensor) -> Memory:
-        """Return no place in the gap yet: the first force finds its side."""
-        return {"gap": velocity.new_full((*velocity.shape[:-1], 1), torch.nan)}
-
-    def forces(
-        self, strength: Tensor, memory: Memory, now: Now
-    ) -> tuple[Mapping[str, Tensor], Memory]:
-        """Return the change of commands."""
-        largest, fastest, gear = now.robot.actuator_limits
-        force, half = now.actuator_force, strength / 2
-        side = (force * gear).sign()
-        gap = filled(memory["gap"], side * half)
-        closing = fastest / gear * force / largest
-        gap = (gap + now.timestep * closing).clamp(-half, half)
-        engaged = gap * side >= half
-        return _change(torch.where(engaged, force, 0.0), now), {"gap": gap}
-
-
-class SeriesElasticity(_Transmission):
-    """A spring of stiffness ``k = 1/s`` between motor and joint, seen by the joint as a resonance.
-
-    The motor's deflection ``x`` obeys ``J ẍ = F − k x − c ẋ``, with ``J`` the inertia at the joint
-    and ``c = 2 ζ √(k J)``; the joint receives ``k x + c ẋ``. Solved exactly over each time step,
-    so that stiff springs are stable and the limit ``s = 0`` is a rigid shaft. In rad/(N m) or m/N,
-    up to a resonance of 2 Hz.
-
-    Args:
-        damping: ``ζ``, a fraction of the critical damping.
-    """
-
-    name, unit, group = "series_elasticity", "rad/(N m)", "elasticity"
-
-    def __init__(self, damping: float = 0.1) -> None:
-        self.damping = damping
-
-    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
-        """Return 0 and the compliance that resonates at 2 Hz."""
-        soft = 1 / (_inertia(robot) * (2 * math.pi * 2.0) ** 2)
-        return torch.zeros_like(soft), soft
-
-    def start(self, velocity: Tensor) -> Memory:
-        """Return no deflection yet: the first force is in equilibrium."""
-        unknown = velocity.new_full((*velocity.shape[:-1], 1), torch.nan)
-        return {"load": unknown, "rate": torch.zeros_like(unknown)}
-
-    def forces(
-        self, strength: Tensor, memory: Memory, now: Now
-    ) -> tuple[Mapping[str, Tensor], Memory]:
-        """Return the change of commands.
-
-        With ``y = k x`` the equation is ``ÿ = ω² (F − y) − 2 ζ ω ẏ``, ``ω² = k / J``.
-        """
-        force, damping = now.actuator_force, self.damping
-        inertia = _inertia(now.robot).to(force)
-        omega = 1 / (torch.where(strength > 0, strength, 1.0) * inertia).sqrt()
-        ringing = omega * math.sqrt(1 - damping**2)
-        left = torch.exp(-damping * omega * now.timestep)
-        phase = ringing * now.timestep
-        off = filled(memory["load"], force) - force
-        slope = (memory["rate"] + damping * omega * off) / ringing
-        after = left * (off * phase.cos() + slope * phase.sin())
-        rate = (
-            left * ((slope * phase.cos() - off * phase.sin()) * ringing) - damping * omega * after
-        )
-        load = force + after
-        passed = torch.where(strength > 0, load + 2 * damping / omega * rate, force)
-        load = torch.where(strength > 0, load, force)
-        rate = torch.where(strength > 0, rate, 0.0)
-        return _change(passed, now), {"load": load, "rate": rate}
-
-
-def _inertia(robot: Robot) -> Tensor:
-    inertia = torch.from_numpy(robot.require_model().dof_M0[list(robot.dof_index)])
-    return _at_actuators(inertia, robot)

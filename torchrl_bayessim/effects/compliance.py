@@ -1,0 +1,217 @@
+"""What lies between motor and joint: a gap, a spring, at every time step.
+
+A rotor of inertia ``I``, the armature, and a load of ``M = J − I``, for the inertia ``J`` at the
+joint, move against each other. What this motion ``x`` takes of the motor's force ``F`` the joint
+gets later: ``F − I ẍ`` passes, of each time step the mean, so that steps may be longer than what
+happens within. The rotor also lags behind where other forces move the joint: ``I ẍ`` loses ``I a``
+for the joint's acceleration ``a`` that ``F − I ẍ`` does not explain, as it was a time step ago.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Backlash", "SeriesElasticity"]
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from .effect import Effect, Memory, Now, Reach
+from .history import filled
+from .robot import Robot
+from .transmission import TransmissionEffect, at_actuators, change
+
+
+class Backlash(TransmissionEffect):
+    """A gap of width ``s``: no force passes until the motor has crossed it.
+
+    The motor's place in the gap ``β ∈ [−s/2, s/2]`` follows ``β̇ = v_max F / F_max``, the speed at
+    which it leaves the joint while nothing holds it; force passes at the side that it pushes. In
+    rad or m of the joint, up to 0.1 (6°).
+
+    Args:
+        rotor: Whether the motor's rotor is free in the gap instead, ``I β̈ = F − I a J / M``, and
+            stops dead at a side, where the joint gets its momentum: ``F − I Δβ̇ / Δt`` passes. Only
+            motors with an armature have that.
+    """
+
+    name, unit, group = "backlash", "rad", "elasticity"
+
+    def __init__(self, *, rotor: bool = False) -> None:
+        self.rotor = rotor
+
+    def forms(self, seconds: float) -> tuple[Effect, ...]:
+        """Return both laws."""
+        del seconds
+        return Backlash(), Backlash(rotor=True)
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the actuators' names, for a rotor those that have some armature."""
+        names = super().targets(robot)
+        return names if not self.rotor or (names and bool((_rotors(robot) > 0).any())) else ()
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and a tenth of a radian or of the joint's range."""
+        wide = 0.1 * at_actuators(robot.position_scale, robot).clamp(max=1.0)
+        if self.rotor:
+            wide = torch.where(_rotors(robot) > 0, wide, 0.0)
+        return torch.zeros_like(wide), wide
+
+    def start(self, velocity: Tensor) -> Memory:
+        """Return no place in the gap yet: the first force finds its side."""
+        gap = velocity.new_full((*velocity.shape[:-1], 1), torch.nan)
+        if not self.rotor:
+            return {"gap": gap}
+        return {"gap": gap, "speed": torch.zeros_like(gap), **_at_rest(gap)}
+
+    def forces(
+        self, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Mapping[str, Tensor], Memory]:
+        """Return the change of commands."""
+        _, _, gear = now.robot.actuator_limits
+        half = strength / 2
+        gap = filled(memory["gap"], (now.actuator_force * gear).sign() * half)
+        if not self.rotor:
+            passed, gap = _led(half, gap, now)
+            return change(passed, now), {"gap": gap}
+        passed, gap, speed = _free(half, gap, memory, now)
+        return _handed_on(passed, now), {"gap": gap, "speed": speed, **_seen(passed, now)}
+
+
+def _led(half: Tensor, gap: Tensor, now: Now) -> tuple[Tensor, Tensor]:
+    """Return the mean force that passes, and the place in the gap of what its force moves."""
+    largest, fastest, gear = now.robot.actuator_limits
+    force = now.actuator_force
+    way = now.timestep * fastest / gear * force / largest
+    beyond = (gap + way) * (force * gear).sign() - half
+    share = torch.where(way != 0, beyond / way.abs(), 1.0).clamp(0.0, 1.0)
+    return force * share, (gap + way).clamp(-half, half)
+
+
+def _free(half: Tensor, gap: Tensor, memory: Memory, now: Now) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the mean force that passes, the rotor's place in the gap and its speed."""
+    _, _, gear = now.robot.actuator_limits
+    rotor = _rotors(now.robot).to(gap)
+    inertia = torch.where(rotor > 0, rotor, 1.0) / gear
+    gain = now.timestep * (now.actuator_force - _lag(memory, now)) / inertia
+    there = gap + now.timestep * (memory["speed"] + gain / 2)
+    after = torch.where(there.abs() < half, memory["speed"] + gain, 0.0)
+    taken = inertia * (after - memory["speed"]) / now.timestep
+    return now.actuator_force - taken, there.clamp(-half, half), after
+
+
+class SeriesElasticity(TransmissionEffect):
+    """A spring of stiffness ``k = 1/s`` between motor and joint, seen by the joint as a resonance.
+
+    ``I ẍ (1 − I/J) = F (1 − I/J) − k x − c ẋ − I a`` with ``c = 2 ζ √(k μ)``, ``μ = I M / J``;
+    without an armature the spring has the whole joint's inertia, ``J ẍ = F − k x − c ẋ``. Solved
+    exactly over each time step: stiff springs are stable, and the limit ``s = 0`` is a rigid shaft.
+    In rad/(N m) or m/N, up to a resonance ``√(k/μ)`` of 2 Hz.
+
+    Args:
+        damping: ``ζ``, a fraction of the critical damping. A diagnosis fits it, from so much that a
+            search for the period finds its way.
+    """
+
+    name, unit, group = "series_elasticity", "rad/(N m)", "elasticity"
+    search_power = 2.0  # the period shows
+    nuisances = ("damping",)
+
+    def __init__(self, damping: float = 0.3) -> None:
+        self.damping = damping
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the damping."""
+        del reach
+        return {"damping": (0.01, 0.01, 0.9)}
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and the compliance that resonates at 2 Hz."""
+        soft = 1 / (_reduced(robot) * (2 * math.pi * 2.0) ** 2)
+        return torch.zeros_like(soft), soft
+
+    def start(self, velocity: Tensor) -> Memory:
+        """Return no deflection yet: the first force is in equilibrium."""
+        unknown = velocity.new_full((*velocity.shape[:-1], 1), torch.nan)
+        return {"load": unknown, "rate": torch.zeros_like(unknown), **_at_rest(unknown)}
+
+    def forces(
+        self, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Mapping[str, Tensor], Memory]:
+        """Return the change of commands.
+
+        With ``y = k x J / M`` the equation is ``ÿ = ω² (F − I a J / M − y) − 2 ζ ω ẏ`` for
+        ``ω² = k / μ``, and ``F − Δẏ / (ω² Δt)`` passes.
+        """
+        pull, damping = now.actuator_force - _lag(memory, now), self.damping
+        inertia = _reduced(now.robot).to(pull)
+        omega = 1 / (torch.where(strength > 0, strength, 1.0) * inertia).sqrt()
+        ringing = omega * math.sqrt(1 - damping**2)
+        left = torch.exp(-damping * omega * now.timestep)
+        phase = ringing * now.timestep
+        off = filled(memory["load"], pull) - pull
+        slope = (memory["rate"] + damping * omega * off) / ringing
+        after = left * (off * phase.cos() + slope * phase.sin())
+        rate = (
+            left * ((slope * phase.cos() - off * phase.sin()) * ringing) - damping * omega * after
+        )
+        mean = now.actuator_force - (rate - memory["rate"]) / (omega**2 * now.timestep)
+        passed = torch.where(strength > 0, mean, now.actuator_force)
+        load = torch.where(strength > 0, pull + after, pull)
+        rate = torch.where(strength > 0, rate, 0.0)
+        return _handed_on(passed, now), {"load": load, "rate": rate, **_seen(passed, now)}
+
+
+def _handed_on(passed: Tensor, now: Now) -> Mapping[str, Tensor]:
+    """Return the change of commands, and what is beyond their limits as forces at the joints.
+
+    A rotor that is stopped may exert more than its motor.
+    """
+    changed = change(passed, now)
+    beyond = passed - now.under(now.command + changed["command"]).actuator_force
+    return {**changed, "force": beyond @ now.actuators.moment}
+
+
+def _at_rest(unknown: Tensor) -> Memory:
+    """Return the memory of nothing seen yet."""
+    return {"velocity": unknown, "passed": torch.zeros_like(unknown)}
+
+
+def _seen(passed: Tensor, now: Now) -> Memory:
+    """Return what the next time step has to know of this one."""
+    return {"velocity": now.actuator_velocity.expand_as(passed), "passed": passed}
+
+
+def _lag(memory: Memory, now: Now) -> Tensor:
+    """Return ``I a J / M``, the force that keeps the rotor with a joint that others move.
+
+    Where the rotor is most of the inertia, less: an error of ``J``, which depends on the pose,
+    would come back larger.
+    """
+    _, _, gear = now.robot.actuator_limits
+    rotor, inertia = _rotors(now.robot), _inertia(now.robot)
+    factor = torch.minimum(rotor * inertia / (inertia - rotor), inertia / 2) / gear**2
+    own = memory["passed"] * gear**2 / inertia
+    before = filled(memory["velocity"], now.actuator_velocity)
+    moved = (now.actuator_velocity - before) / now.timestep
+    return torch.where(memory["velocity"].isnan(), 0.0, factor * (moved - own))
+
+
+def _inertia(robot: Robot) -> Tensor:
+    """Return the inertia ``J`` at the joint of each actuator."""
+    model = robot.require_model()
+    return at_actuators(torch.from_numpy(model.dof_M0[list(robot.dof_index)]), robot)
+
+
+def _rotors(robot: Robot) -> Tensor:
+    """Return the rotor's part of it, the armature ``I``."""
+    model = robot.require_model()
+    return at_actuators(torch.from_numpy(model.dof_armature[list(robot.dof_index)]), robot)
+
+
+def _reduced(robot: Robot) -> Tensor:
+    """Return ``μ`` at the joint of each actuator, ``J`` where there is no armature."""
+    rotor, inertia = _rotors(robot), _inertia(robot)
+    both = rotor * (inertia - rotor) / inertia
+    return torch.where(both > 0, both, inertia)
