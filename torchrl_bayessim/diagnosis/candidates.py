@@ -145,4 +145,8 @@ def strength_errors(fit: Fit, dispersion: float, size: int) -> dict[Unit, float]
     """Return the standard error of each strength, beside ``size`` parameters."""
     covariance = fit.covariance(dispersion)
     deviations = np.sqrt(np.maximum(np.diag(covariance)[size:], 0.0))
-    return {u: float(d * (u.high - u.onset)) for u, d in zip(fit.units, deviations, strict=True)}
+    strengths = fit.point.strengths
+    return {
+        u: float(d * u.high * u.slope(strengths[u]))
+        for u, d in zip(fit.units, deviations, strict=True)
+    }

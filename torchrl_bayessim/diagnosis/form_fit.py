@@ -45,8 +45,8 @@ class _Shift:
     most: float
 
     def paid(self, offered: Collection[Unit]) -> bool:
-        """Return whether the number has been fitted: of a wave, or none that was offered."""
-        if not np.isfinite(self.least):
+        """Return whether it is fitted anyway, or has been: of a wave, or none that was offered."""
+        if not np.isfinite(self.least) or self.number in self.unit.effect.nuisances:
             return True
         return _value(self) not in self.offered(offered)
 

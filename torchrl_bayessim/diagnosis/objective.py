@@ -81,8 +81,19 @@ class Unit:
         return float(np.clip(strength, reach * self.low, reach * self.high))
 
     def actual(self, strength: float) -> float:
-        """Return the effect's own strength: ``onset + strength (1 - onset / high)``, 0 for 0."""
-        return self.onset + strength * (1 - self.onset / self.high) if strength else 0.0
+        """Return the effect's own strength: ``onset + strength (1 - onset / high)``, 0 for 0.
+
+        With ``high |strength / high|^power`` in the place of ``strength`` (`Effect.search_power`).
+        """
+        share = abs(strength / self.high) ** self.effect.search_power
+        bent = float(np.copysign(share * self.high, strength))
+        return self.onset + bent * (1 - self.onset / self.high) if strength else 0.0
+
+    def slope(self, strength: float) -> float:
+        """Return the derivative of `actual`."""
+        power = self.effect.search_power
+        steep = power * abs(strength / self.high) ** (power - 1)
+        return steep * (1 - self.onset / self.high)
 
     def joint(self, robot: Robot) -> int:
         """Return the joint at which it acts, -1 where there is none or there are several."""

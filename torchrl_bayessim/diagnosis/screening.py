@@ -29,6 +29,7 @@ from .refit import Fit, with_prior
 
 Array = NDArray[np.float64]
 LEVELS = (0.05, 0.4)  # of an effect's range
+_BETWEEN = (0.08, 0.13, 0.2)  # where one period does not look like another
 _WILD = 500.0  # standard deviations
 _POWER = 0.84  # of the normal distribution at 0.8, to state what would have been seen
 _HELD_OUT = 2.0  # times that, for other runs to show it too
@@ -169,7 +170,7 @@ def screen(objective: Objective, fit: Fit, units: Sequence[Unit]) -> Screen:
         fit: What is in the model already; its units are projected out like parameters.
         units: The effects to try.
     """
-    rows = [(unit, level * unit.high) for unit in units for level in LEVELS]
+    rows = [(unit, level * unit.high) for unit in units for level in _levels(unit)]
     rows += [(unit, LEVELS[-1] * unit.low) for unit in units if unit.low < 0]
     strengths = fit.point.strengths
     changes, wild = [], []
@@ -190,6 +191,11 @@ def screen(objective: Objective, fit: Fit, units: Sequence[Unit]) -> Screen:
     changes += [changes[i] * np.float32(rows[i][0].low / rows[i][0].high) for i in small]
     wild += [wild[i] for i in small]
     return _compared(rows, changes, fit, objective.size, wild=np.array(wild))
+
+
+def _levels(unit: Unit) -> tuple[float, ...]:
+    """Return the strengths to try, as shares of the unit's range."""
+    return LEVELS if unit.effect.search_power == 1 else tuple(sorted(LEVELS + _BETWEEN))
 
 
 def _is_wild(innovations: Array) -> bool:

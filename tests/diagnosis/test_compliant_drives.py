@@ -1,0 +1,114 @@
+"""Motors behind a gap or a spring, of a robot that has rotor and link as bodies of their own."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.form_fit import _Shift
+from torchrl_bayessim.diagnosis.objective import units_of
+from torchrl_bayessim.effects.catalogue import effect
+from torchrl_bayessim.effects.robot import robot_of
+from torchrl_bayessim.envs.task import Task
+from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.logs.log import Log
+from torchrl_bayessim.logs.system import System
+from torchrl_bayessim.physics.mujoco import MujocoPhysics
+
+ROTOR, LINK = 0.01, 0.02 + 0.5 * 0.1**2  # kg m²
+NOISE = 0.001, 0.01
+LINE = """
+<mujoco><option timestep="{dt}" integrator="implicitfast"/>
+  <default><geom contype="0" conaffinity="0"/></default><worldbody>
+  <body><joint name="joint" axis="0 1 0" damping="0.1" armature="{armature}"/>
+    <inertial pos="0 0 -.1" mass="0.5" diaginertia=".02 .02 .02"/></body>
+  {rotor}
+</worldbody>{tendon}
+<actuator><motor name="motor" joint="{driven}" gear="2" ctrlrange="-2 2"/></actuator></mujoco>
+"""
+BEHIND = f"""<body><joint name="rotor" axis="0 1 0"/>
+  <inertial pos="0 0 0" mass="1" diaginertia="{ROTOR} {ROTOR} {ROTOR}"/></body>"""
+SHAFT = """<tendon><fixed name="shaft" {0}>
+  <joint joint="rotor" coef="1"/><joint joint="joint" coef="-1"/></fixed></tendon>"""
+SOME = (
+    "action_delay", "action_gain", "action_lag", "backlash", "coulomb_friction", "dead_band",
+    "packet_drop", "series_elasticity", "viscous_friction",
+)  # fmt: skip
+
+
+def spring(hertz, damping):
+    reduced = ROTOR * LINK / (ROTOR + LINK)
+    k = reduced * (2 * np.pi * hertz) ** 2
+    return f'stiffness="{k}" damping="{2 * damping * np.sqrt(k * reduced)}" springlength="0"', 1 / k
+
+
+def gap(width):
+    stiff = 'solreflimit="0.002 1" solimplimit="0.99 0.999 0.001"'
+    return f'limited="true" range="{-width / 2} {width / 2}" {stiff}', width
+
+
+def logs(shaft, seed):
+    xml = LINE.format(dt=5e-5, armature=0, rotor=BEHIND, driven="rotor",
+                      tendon=SHAFT.format(shaft))  # fmt: skip
+    model, rng, found = mujoco.MjModel.from_xml_string(xml), np.random.default_rng(seed), []
+    for _ in range(6):
+        data, t = mujoco.MjData(model), 0.02 * np.arange(200)
+        waves = rng.uniform(0.2, 0.5, 4), rng.uniform(2.0, 18.0, 4), rng.uniform(0.0, 6.0, 4)
+        u = sum(a * np.sin(w * t + p) for a, w, p in zip(*waves, strict=True))
+        rows = []
+        for command in u:
+            rows.append([data.qpos[0], data.qvel[0]])
+            data.ctrl[0] = command
+            mujoco.mj_step(model, data, 400)
+        seen = np.array(rows) + rng.normal(size=(len(t), 2)) * NOISE
+        found.append(
+            Log(
+                name=f"run{len(found)}",
+                time=torch.from_numpy(t),
+                qpos=torch.from_numpy(seen[:, :1].copy()),
+                qvel=torch.from_numpy(seen[:, 1:].copy()),
+                ctrl=torch.from_numpy(u[:, None].copy()),
+                velocity_gain=torch.zeros(1).double(),
+                measured=torch.ones(2, dtype=torch.bool),
+            )
+        )
+    return found
+
+
+def one_body():
+    xml = LINE.format(dt=0.002, armature=ROTOR, rotor="", tendon="", driven="joint")
+    return Task(model=mujoco.MjModel.from_xml_string(xml), frame_skip=10)
+
+
+@pytest.mark.parametrize(
+    ("name", "shaft", "within"),
+    [
+        ("series_elasticity", spring(10.0, 0.2), 0.1),
+        ("series_elasticity", spring(22.0, 0.2), 0.25),
+        ("backlash", gap(0.05), 0.15),
+    ],
+)
+def test_what_is_between_rotor_and_link_is_named_with_its_size(name, shaft, within):
+    said, size = shaft
+    bounds = {"dof_damping[joint]": (0.05, 0.2)}
+    system = System(task=one_body(), physics=MujocoPhysics(*bounds), prior=BoxPrior(bounds))
+    report = diagnose(system, None, logs(said, seed=1), effects=SOME)
+    assert report.effects[0].name == name
+    assert report.effects[0].strength == pytest.approx(size, rel=within)
+    assert report.gap.with_effects < 2.0
+
+
+def test_the_interval_of_a_compliance_allows_for_a_damping_that_nobody_knows():
+    shift = _Shift(units_of([effect("series_elasticity")], robot_of(one_body()))[0], "damping",
+                   0.01, 0.01, 0.9)  # fmt: skip
+    assert shift.paid([shift.unit])
+
+
+def test_a_search_counts_the_compliance_of_a_shaft_by_its_period():
+    (unit,) = units_of([effect("series_elasticity")], robot_of(one_body()))
+    assert unit.actual(unit.high) == pytest.approx(unit.high)  # 2 Hz
+    assert unit.actual(0.1 * unit.high) == pytest.approx(0.01 * unit.high)  # 20 Hz
+    assert unit.actual(0.0) == 0.0
+    around = unit.actual(0.301 * unit.high) - unit.actual(0.299 * unit.high)
+    assert unit.slope(0.3 * unit.high) == pytest.approx(around / (0.002 * unit.high))
