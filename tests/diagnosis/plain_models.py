@@ -13,6 +13,7 @@ from torchrl_bayessim.diagnosis.refit import Fit
 class Unit(NamedTuple):
     name: str
     where: str = "hip"
+    high: float = 1.0
 
     @property
     def effect(self):
@@ -27,5 +28,6 @@ def plain(units, deviance, *, z=0.0, segments=40, flipped=False):
     left = np.full((segments // 2, 10), np.sqrt(deviance / (10 * segments))) * (-1) ** flipped
     strengths = dict(units) if isinstance(units, dict) else dict.fromkeys(units, 1.0)
     point = Point(np.array([z]), strengths)
-    fit = Fit(point, tuple(units), left, np.zeros((left.size, 0)))
+    jacobian = np.ones((left.size, 1 + len(units)))
+    fit = Fit(point, tuple(units), left, jacobian)
     return Model(fit=fit, validation=left, logs=np.arange(segments))

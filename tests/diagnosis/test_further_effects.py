@@ -67,3 +67,12 @@ def test_what_a_force_a_little_off_would_leave_is_no_cause_of_its_own():
     """A few hundred-thousandths of the gap, though six times the noise."""
     start, base, better = plain([], 1e8), plain([A], 2400.0), plain([A, C], 450.0)
     assert not identified(start, base, better, [better])
+
+
+@pytest.mark.parametrize(("strength", "added"), [(1e-3, True), (1.0, False)])
+def test_what_comes_in_the_place_of_a_second_effect_is_no_third(strength, added):
+    """Drift and a payload leave little; with magnets the drift is nothing."""
+    drift, magnets = Unit("drift"), Unit("magnets")
+    start, base = plain([], 1e6), plain([A, drift], 2400.0)
+    better = plain({A: 1.0, drift: strength, magnets: 1.0}, 450.0)
+    assert identified(start, base, better, [better]) == added

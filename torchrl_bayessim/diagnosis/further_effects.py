@@ -17,7 +17,8 @@ import numpy as np
 
 from ..effects.action import ActionDelay
 from ..effects.sensors import SensorDelay
-from .model import Model, as_good, gain
+from .model import LIKELY, Model, as_good, gain
+from .objective import Unit
 
 _SHARE = 0.1  # of the gap: what an effect that could be another must remove to be kept
 _REST = 0.5  # of what the base leaves: what any further effect must remove
@@ -65,11 +66,19 @@ def identified(
     just_this = gain(base, better) > _SURELY and removed > 1.0 - _NOTHING
     if _leaves_less(start, base, _REMAINS):
         # a simulator that integrates otherwise is late, too, by a part of its time step
-        second = len({unit.name for unit in base.units}) == 1
+        second = len({unit.name for unit in base.units if _does_something(unit, better)}) <= 1
         second &= ActionDelay.group not in added or _later(base, better, timestep)
         if not second or not (just_this or (lone and removed > _REST)):
             return False
     return (before > _WRONG or just_this) and not _rivalled(base, better, models)
+
+
+def _does_something(unit: Unit, model: Model) -> bool:
+    """Return whether a unit moves what a model predicts by more than chance would let it."""
+    fit = model.fit
+    column = fit.jacobian[:, len(fit.point.z) + fit.units.index(unit)]
+    part = column * fit.point.strengths[unit] / unit.high
+    return float(part @ part) > LIKELY
 
 
 def _later(base: Model, better: Model, timestep: float) -> bool:
