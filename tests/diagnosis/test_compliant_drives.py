@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 import torch
 
+from torchrl_bayessim.diagnosis.candidates import strength_errors
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.form_fit import _Shift
-from torchrl_bayessim.diagnosis.objective import units_of
+from torchrl_bayessim.diagnosis.objective import Point, units_of
+from torchrl_bayessim.diagnosis.refit import Fit
 from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.effects.robot import robot_of
 from torchrl_bayessim.envs.task import Task
@@ -99,7 +101,7 @@ def test_what_is_between_rotor_and_link_is_named_with_its_size(name, shaft, with
     assert report.gap.with_effects < 2.0
 
 
-def test_the_interval_of_a_compliance_allows_for_a_damping_that_nobody_knows():
+def test_the_damping_of_a_shaft_is_fitted_in_any_case():
     shift = _Shift(units_of([effect("series_elasticity")], robot_of(one_body()))[0], "damping",
                    0.01, 0.01, 0.9)  # fmt: skip
     assert shift.paid([shift.unit])
@@ -112,3 +114,22 @@ def test_a_search_counts_the_compliance_of_a_shaft_by_its_period():
     assert unit.actual(0.0) == 0.0
     around = unit.actual(0.301 * unit.high) - unit.actual(0.299 * unit.high)
     assert unit.slope(0.3 * unit.high) == pytest.approx(around / (0.002 * unit.high))
+
+
+def test_what_is_not_known_of_a_compliance_is_not_nothing_at_zero():
+    (unit,) = units_of([effect("series_elasticity")], robot_of(one_body()))
+    rng = np.random.default_rng(0)
+    jacobian = rng.normal(size=(400, 2)) * 5.0
+    errors = [
+        strength_errors(
+            Fit(Point(np.zeros(1), {unit: s}), (unit,), np.zeros((20, 20)), jacobian), 1.0, 1
+        )[unit]
+        for s in (0.0, 0.1 * unit.high, 0.2 * unit.high)
+    ]
+    assert 0 < errors[0] < 0.001 * unit.high
+    assert errors[2] / errors[1] == pytest.approx(2.0, rel=0.1)  # of a square
+
+
+def test_fits_reach_as_far_as_the_prior_that_a_report_offers():
+    (unit,) = units_of([effect("series_elasticity")], robot_of(one_body()))
+    assert unit.actual(unit.inside(np.inf)) == pytest.approx(2 * unit.high)

@@ -1,10 +1,12 @@
 """What moves the data too far to be compared would have been seen."""
 
 import numpy as np
+import pytest
 import torch
 from test_diagnose import logs, run, system
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.screening import crossing
 
 
 class Quiet:
@@ -31,3 +33,10 @@ def test_an_effect_that_is_far_too_strong_is_not_called_invisible():
     assert not [c.name for c in report.candidates if c.status == "not_excited"]
     spring = next(c for c in report.candidates if c.name == "parallel_spring")
     assert 0 < spring.minimal_detectable_strength < 0.05
+
+
+@pytest.mark.parametrize(("norms", "found"), [([10.0, 80.0], 0.1), ([10.0, 1000.0], 10**-0.5)])
+def test_below_the_lowest_level_norms_fall_as_they_do_above_it(norms, found):
+    """In proportion, or faster: a tenth of the norm at 0.1 of the strength, or at 0.32 of it."""
+    strengths = np.array([1.0, 10.0])
+    assert crossing(strengths, np.array(norms), 1.0) == pytest.approx(found)

@@ -145,8 +145,8 @@ def strength_errors(fit: Fit, dispersion: float, size: int) -> dict[Unit, float]
     """Return the standard error of each strength, beside ``size`` parameters."""
     covariance = fit.covariance(dispersion)
     deviations = np.sqrt(np.maximum(np.diag(covariance)[size:], 0.0))
-    strengths = fit.point.strengths
-    return {
-        u: float(d * u.high * u.slope(strengths[u]))
-        for u, d in zip(fit.units, deviations, strict=True)
-    }
+    result = {}
+    for unit, deviation in zip(fit.units, deviations * [u.high for u in fit.units], strict=True):
+        between = abs(fit.point.strengths[unit]) + deviation / 2  # at 0 a power has no slope
+        result[unit] = float(deviation * unit.slope(between))
+    return result

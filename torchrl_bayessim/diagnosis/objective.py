@@ -77,7 +77,7 @@ class Unit:
 
         Fractions stay in it, since less than nothing of a friction is none that a simulator knows.
         """
-        reach = 1.0 if self.effect.unit == "fraction" else 2.0
+        reach = 1.0 if self.effect.unit == "fraction" else 2.0 ** (1 / self.effect.search_power)
         return float(np.clip(strength, reach * self.low, reach * self.high))
 
     def actual(self, strength: float) -> float:

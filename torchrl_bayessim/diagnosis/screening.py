@@ -248,13 +248,18 @@ def _basis(fit: Fit, size: int) -> Array:
 
 
 def crossing(strengths: Array, norms: Array, threshold: float) -> float:
-    """Return where ``norms`` reach ``threshold``, between two levels by a power law."""
+    """Return where ``norms`` reach ``threshold``, between two levels by a power law.
+
+    Below the lowest level in proportion, or by the power between the first two if they rise faster.
+    """
     above = np.flatnonzero(norms >= threshold)
     if not len(above):
         return float("inf")
     i = int(above[0])
     if i == 0:
-        return float(strengths[0] * threshold / norms[0])
+        rise = np.log(norms[1] / norms[0]) if len(norms) > 1 else 0.0
+        power = max(1.0, rise / np.log(strengths[1] / strengths[0])) if rise > 0 else 1.0
+        return float(strengths[0] * (threshold / norms[0]) ** (1 / power))
     if norms[i - 1] <= 0:
         return float(strengths[i])
     power = np.log(norms[i] / norms[i - 1]) / np.log(strengths[i] / strengths[i - 1])

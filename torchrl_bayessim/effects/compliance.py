@@ -1,10 +1,11 @@
 """What lies between motor and joint: a gap, a spring, at every time step.
 
-A rotor of inertia ``I``, the armature, and a load of ``M = J − I``, for the inertia ``J`` at the
-joint, move against each other. What this motion ``x`` takes of the motor's force ``F`` the joint
-gets later: ``F − I ẍ`` passes, of each time step the mean, so that steps may be longer than what
-happens within. The rotor also lags behind where other forces move the joint: ``I ẍ`` loses ``I a``
-for the joint's acceleration ``a`` that ``F − I ẍ`` does not explain, as it was a time step ago.
+A rotor of inertia ``I``, the nominal armature of a motor that has its joint for itself, and a load
+of ``M = J − I``, for the inertia ``J`` at the joint in the model's initial pose, move against each
+other. What this motion ``x`` takes of the motor's force ``F`` the joint gets later: ``F − I ẍ``
+passes, of each time step the mean, so that steps may be longer than what happens within. The rotor
+also lags behind where other forces move the joint: ``I ẍ`` loses ``I a`` for the joint's
+acceleration ``a`` that ``F − I ẍ`` does not explain, as it was a time step ago.
 """
 
 from __future__ import annotations
@@ -17,10 +18,12 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from ..kinds import check_kind
+from ..scalars import check_number
 from .effect import Effect, Memory, Now, Reach
 from .history import filled
 from .robot import Robot
-from .transmission import TransmissionEffect, at_actuators, change
+from .transmission import TransmissionEffect, at_actuators, change, servos
 
 
 class Backlash(TransmissionEffect):
@@ -33,12 +36,13 @@ class Backlash(TransmissionEffect):
     Args:
         rotor: Whether the motor's rotor is free in the gap instead, ``I β̈ = F − I a J / M``, and
             stops dead at a side, where the joint gets its momentum: ``F − I Δβ̇ / Δt`` passes. Only
-            motors with an armature have that.
+            motors with an armature have that; others are rigid.
     """
 
     name, unit, group = "backlash", "rad", "elasticity"
 
     def __init__(self, *, rotor: bool = False) -> None:
+        check_kind("rotor to be true or false", rotor, bool)
         self.rotor = rotor
 
     def forms(self, seconds: float) -> tuple[Effect, ...]:
@@ -96,7 +100,7 @@ def _free(half: Tensor, gap: Tensor, memory: Memory, now: Now) -> tuple[Tensor, 
     inertia = torch.where(rotor > 0, rotor, 1.0) / gear
     gain = now.timestep * (now.actuator_force - _lag(memory, now)) / inertia
     there = gap + now.timestep * (memory["speed"] + gain / 2)
-    after = torch.where(there.abs() < half, memory["speed"] + gain, 0.0)
+    after = torch.where((there.abs() < half) & (rotor > 0), memory["speed"] + gain, 0.0)
     taken = inertia * (after - memory["speed"]) / now.timestep
     return now.actuator_force - taken, there.clamp(-half, half), after
 
@@ -112,6 +116,9 @@ class SeriesElasticity(TransmissionEffect):
     Args:
         damping: ``ζ``, a fraction of the critical damping. A diagnosis fits it, from so much that a
             search for the period finds its way.
+
+    Raises:
+        ValueError: ``damping`` is not at least 0 and below 1: the spring would not ring.
     """
 
     name, unit, group = "series_elasticity", "rad/(N m)", "elasticity"
@@ -119,6 +126,7 @@ class SeriesElasticity(TransmissionEffect):
     nuisances = ("damping",)
 
     def __init__(self, damping: float = 0.3) -> None:
+        check_number("damping of a spring, a fraction of the critical", damping, least=0.0, below=1)
         self.damping = damping
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
@@ -187,15 +195,17 @@ def _lag(memory: Memory, now: Now) -> Tensor:
     """Return ``I a J / M``, the force that keeps the rotor with a joint that others move.
 
     Where the rotor is most of the inertia, less: an error of ``J``, which depends on the pose,
-    would come back larger.
+    would come back larger. And never more than the motor's largest force, so that where ``I`` and
+    ``J`` are not those of the simulator it does not grow for ever.
     """
-    _, _, gear = now.robot.actuator_limits
+    largest, _, gear = now.robot.actuator_limits
     rotor, inertia = _rotors(now.robot), _inertia(now.robot)
     factor = torch.minimum(rotor * inertia / (inertia - rotor), inertia / 2) / gear**2
     own = memory["passed"] * gear**2 / inertia
     before = filled(memory["velocity"], now.actuator_velocity)
     moved = (now.actuator_velocity - before) / now.timestep
-    return torch.where(memory["velocity"].isnan(), 0.0, factor * (moved - own))
+    lag = (factor * (moved - own)).clamp(-largest, largest)
+    return torch.where(memory["velocity"].isnan(), 0.0, lag)
 
 
 def _inertia(robot: Robot) -> Tensor:
@@ -205,9 +215,17 @@ def _inertia(robot: Robot) -> Tensor:
 
 
 def _rotors(robot: Robot) -> Tensor:
-    """Return the rotor's part of it, the armature ``I``."""
-    model = robot.require_model()
-    return at_actuators(torch.from_numpy(model.dof_armature[list(robot.dof_index)]), robot)
+    """Return the rotor's part of it, the armature ``I``; none of servos and of shared joints.
+
+    A servo measures at the rotor or at the joint, nobody says which, and reacts to what the spring
+    does.
+    """
+    model, joints = robot.require_model(), robot.joint_of_actuator
+    armature = at_actuators(torch.from_numpy(model.dof_armature[list(robot.dof_index)]), robot)
+    for i, joint in enumerate(joints):
+        if joints.count(joint) > 1 or i in servos(robot):
+            armature[i] = 0.0
+    return armature
 
 
 def _reduced(robot: Robot) -> Tensor:
