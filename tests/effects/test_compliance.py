@@ -188,6 +188,15 @@ def test_motors_that_share_a_joint_or_have_no_rotor_are_rigid_in_a_gap():
         assert not added["qfrc_applied"].any()
 
 
+def test_a_rotor_that_is_most_of_the_inertia_is_none_to_these_laws():
+    robot = robot_of(Task(model=chain([1.0, 0.01, 0.01]), frame_skip=4))
+    high = effect("backlash", rotor=True).bounds(robot)[1]
+    assert (high > 0).tolist() == [False, True, True]
+    whole = robot.model.dof_M0[0]
+    softest = effect("series_elasticity").bounds(robot)[1][0].item()
+    assert softest == pytest.approx(1 / (whole * (4 * np.pi) ** 2))
+
+
 @pytest.mark.parametrize(
     ("name", "options", "error", "match"),
     [

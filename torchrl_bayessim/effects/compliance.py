@@ -14,6 +14,7 @@ __all__ = ["Backlash", "SeriesElasticity"]
 
 import math
 from collections.abc import Mapping
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -24,6 +25,8 @@ from .effect import Effect, Memory, Now, Reach
 from .history import filled
 from .robot import Robot
 from .transmission import TransmissionEffect, at_actuators, change, servos
+
+_ROBOTS = 16  # whose inertias are kept: laws ask at every time step
 
 
 class Backlash(TransmissionEffect):
@@ -208,26 +211,31 @@ def _lag(memory: Memory, now: Now) -> Tensor:
     return torch.where(memory["velocity"].isnan(), 0.0, lag)
 
 
+@lru_cache(_ROBOTS)
 def _inertia(robot: Robot) -> Tensor:
     """Return the inertia ``J`` at the joint of each actuator."""
     model = robot.require_model()
     return at_actuators(torch.from_numpy(model.dof_M0[list(robot.dof_index)]), robot)
 
 
+@lru_cache(_ROBOTS)
 def _rotors(robot: Robot) -> Tensor:
     """Return the rotor's part of it, the armature ``I``; none of servos and of shared joints.
 
     A servo measures at the rotor or at the joint, nobody says which, and reacts to what the spring
-    does.
+    does. Nor where it is most of the inertia: the load's own, which moves against it, then is what
+    is left of ``J`` in a pose, and nothing that one number tells.
     """
     model, joints = robot.require_model(), robot.joint_of_actuator
     armature = at_actuators(torch.from_numpy(model.dof_armature[list(robot.dof_index)]), robot)
+    armature = torch.where(armature > _inertia(robot) / 2, 0.0, armature)
     for i, joint in enumerate(joints):
         if joints.count(joint) > 1 or i in servos(robot):
             armature[i] = 0.0
     return armature
 
 
+@lru_cache(_ROBOTS)
 def _reduced(robot: Robot) -> Tensor:
     """Return ``μ`` at the joint of each actuator, ``J`` where there is no armature."""
     rotor, inertia = _rotors(robot), _inertia(robot)
