@@ -85,11 +85,7 @@ def unit_credit(selection: Selection, credit: Mapping[str, float]) -> dict[Unit,
     Those of one effect share it by the squared length of what each changes.
     """
     fit = selection.best.fit
-    columns = fit.jacobian[:, len(fit.point.z) :]
-    sizes = {
-        unit: float((columns[:, i] ** 2).sum()) * (fit.point.strengths[unit] / unit.high) ** 2
-        for i, unit in enumerate(fit.units)
-    }
+    sizes = {unit: float((fit.change(unit) ** 2).sum()) for unit in fit.units}
     sums = {name: sum(s for u, s in sizes.items() if u.name == name) for name in credit}
     return {
         u: max(credit.get(u.name, 0.0), 0.0) * size / max(sums.get(u.name, 0.0), 1e-30)

@@ -75,10 +75,7 @@ def identified(
 
 def _does_something(unit: Unit, model: Model) -> bool:
     """Return whether a unit moves what a model predicts by more than chance would let it."""
-    fit = model.fit
-    column = fit.jacobian[:, len(fit.point.z) + fit.units.index(unit)]
-    part = column * fit.point.strengths[unit] / unit.high
-    return float(part @ part) > LIKELY
+    return float((model.fit.change(unit) ** 2).sum()) > LIKELY
 
 
 def _later(base: Model, better: Model, timestep: float) -> bool:

@@ -79,13 +79,18 @@ class Fit:
         jacobian = np.c_[self.jacobian, np.zeros(len(self.jacobian))]
         return Fit(point, (*self.units, unit), self.innovations, jacobian)
 
+    def change(self, unit: Unit) -> Array:
+        """Return what a unit moves the innovations by, by its derivatives, shape ``(S·KC,)``."""
+        return self.jacobian[:, self._column(unit)] * self.point.strengths[unit] / unit.high
+
+    def _column(self, unit: Unit) -> int:
+        return len(self.point.z) + self.units.index(unit)
+
     def without(self, unit: Unit) -> Fit:
         """Return the fit with a unit at zero and no longer free, by its derivatives."""
-        column = len(self.point.z) + self.units.index(unit)
         strengths = {u: s for u, s in self.point.strengths.items() if u != unit}
-        change = self.jacobian[:, column] * self.point.strengths[unit] / unit.high
-        left = self.innovations - change.reshape(self.innovations.shape)
-        jacobian = np.delete(self.jacobian, column, axis=1)
+        left = self.innovations - self.change(unit).reshape(self.innovations.shape)
+        jacobian = np.delete(self.jacobian, self._column(unit), axis=1)
         return Fit(Point(self.point.z, strengths), tuple(strengths), left, jacobian)
 
     def covariance(self, dispersion: float) -> Array:

@@ -257,10 +257,15 @@ def crossing(strengths: Array, norms: Array, threshold: float) -> float:
         return float("inf")
     i = int(above[0])
     if i == 0:
-        rise = np.log(norms[1] / norms[0]) if len(norms) > 1 else 0.0
-        power = max(1.0, rise / np.log(strengths[1] / strengths[0])) if rise > 0 else 1.0
+        rising = len(norms) > 1 and norms[1] > norms[0]
+        power = max(1.0, _power(strengths, norms, 1)) if rising else 1.0
         return float(strengths[0] * (threshold / norms[0]) ** (1 / power))
     if norms[i - 1] <= 0:
         return float(strengths[i])
-    power = np.log(norms[i] / norms[i - 1]) / np.log(strengths[i] / strengths[i - 1])
+    power = _power(strengths, norms, i)
     return float(strengths[i - 1] * (threshold / norms[i - 1]) ** (1 / max(power, 0.1)))
+
+
+def _power(strengths: Array, norms: Array, i: int) -> float:
+    """Return with which power of the strength norms rise up to level ``i``."""
+    return float(np.log(norms[i] / norms[i - 1]) / np.log(strengths[i] / strengths[i - 1]))

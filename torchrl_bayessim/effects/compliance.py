@@ -197,18 +197,27 @@ def _seen(passed: Tensor, now: Now) -> Memory:
 def _lag(memory: Memory, now: Now) -> Tensor:
     """Return ``I a J / M``, the force that keeps the rotor with a joint that others move.
 
-    Where the rotor is most of the inertia, less: an error of ``J``, which depends on the pose,
-    would come back larger. And never more than the motor's largest force, so that where ``I`` and
-    ``J`` are not those of the simulator it does not grow for ever.
+    Never more than the motor's largest force, so that where ``I`` and ``J`` are not those of the
+    simulator it does not grow for ever.
     """
     largest, _, gear = now.robot.actuator_limits
-    rotor, inertia = _rotors(now.robot), _inertia(now.robot)
-    factor = torch.minimum(rotor * inertia / (inertia - rotor), inertia / 2) / gear**2
-    own = memory["passed"] * gear**2 / inertia
+    own = memory["passed"] * gear**2 / _inertia(now.robot)
     before = filled(memory["velocity"], now.actuator_velocity)
     moved = (now.actuator_velocity - before) / now.timestep
-    lag = (factor * (moved - own)).clamp(-largest, largest)
+    lag = (_kept_along(now.robot) * (moved - own)).clamp(-largest, largest)
     return torch.where(memory["velocity"].isnan(), 0.0, lag)
+
+
+@lru_cache(_ROBOTS)
+def _kept_along(robot: Robot) -> Tensor:
+    """Return ``I J / M`` as each actuator has it, by the square of its gear.
+
+    Where the rotor is more than a third of the inertia, ``J / 2``: an error of ``J``, which depends
+    on the pose, would come back larger.
+    """
+    _, _, gear = robot.actuator_limits
+    rotor, inertia = _rotors(robot), _inertia(robot)
+    return torch.minimum(rotor * inertia / (inertia - rotor), inertia / 2) / gear**2
 
 
 @lru_cache(_ROBOTS)
