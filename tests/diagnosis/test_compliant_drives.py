@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from rotor_and_link import gap, one_body, spring, two_bodies
 
 from torchrl_bayessim.diagnosis.candidates import strength_errors
 from torchrl_bayessim.diagnosis.diagnose import diagnose
@@ -18,42 +19,15 @@ from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.system import System
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
 
-ROTOR, LINK = 0.01, 0.02 + 0.5 * 0.1**2  # kg m²
 NOISE = 0.001, 0.01
-LINE = """
-<mujoco><option timestep="{dt}" integrator="implicitfast"/>
-  <default><geom contype="0" conaffinity="0"/></default><worldbody>
-  <body><joint name="joint" axis="0 1 0" damping="0.1" armature="{armature}"/>
-    <inertial pos="0 0 -.1" mass="0.5" diaginertia=".02 .02 .02"/></body>
-  {rotor}
-</worldbody>{tendon}
-<actuator><motor name="motor" joint="{driven}" gear="2" ctrlrange="-2 2"/></actuator></mujoco>
-"""
-BEHIND = f"""<body><joint name="rotor" axis="0 1 0"/>
-  <inertial pos="0 0 0" mass="1" diaginertia="{ROTOR} {ROTOR} {ROTOR}"/></body>"""
-SHAFT = """<tendon><fixed name="shaft" {0}>
-  <joint joint="rotor" coef="1"/><joint joint="joint" coef="-1"/></fixed></tendon>"""
 SOME = (
     "action_delay", "action_gain", "action_lag", "backlash", "coulomb_friction", "dead_band",
     "packet_drop", "series_elasticity", "viscous_friction",
 )  # fmt: skip
 
 
-def spring(hertz, damping):
-    reduced = ROTOR * LINK / (ROTOR + LINK)
-    k = reduced * (2 * np.pi * hertz) ** 2
-    return f'stiffness="{k}" damping="{2 * damping * np.sqrt(k * reduced)}" springlength="0"', 1 / k
-
-
-def gap(width):
-    stiff = 'solreflimit="0.002 1" solimplimit="0.99 0.999 0.001"'
-    return f'limited="true" range="{-width / 2} {width / 2}" {stiff}', width
-
-
 def logs(shaft, seed):
-    xml = LINE.format(dt=5e-5, armature=0, rotor=BEHIND, driven="rotor",
-                      tendon=SHAFT.format(shaft))  # fmt: skip
-    model, rng, found = mujoco.MjModel.from_xml_string(xml), np.random.default_rng(seed), []
+    model, rng, found = two_bodies(shaft, 5e-5), np.random.default_rng(seed), []
     for _ in range(6):
         data, t = mujoco.MjData(model), 0.02 * np.arange(200)
         waves = rng.uniform(0.2, 0.5, 4), rng.uniform(2.0, 18.0, 4), rng.uniform(0.0, 6.0, 4)
@@ -78,9 +52,8 @@ def logs(shaft, seed):
     return found
 
 
-def one_body():
-    xml = LINE.format(dt=0.002, armature=ROTOR, rotor="", tendon="", driven="joint")
-    return Task(model=mujoco.MjModel.from_xml_string(xml), frame_skip=10)
+def described():
+    return Task(model=one_body(0.002), frame_skip=10)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +67,7 @@ def one_body():
 def test_what_is_between_rotor_and_link_is_named_with_its_size(name, shaft, within):
     said, size = shaft
     bounds = {"dof_damping[joint]": (0.05, 0.2)}
-    system = System(task=one_body(), physics=MujocoPhysics(*bounds), prior=BoxPrior(bounds))
+    system = System(task=described(), physics=MujocoPhysics(*bounds), prior=BoxPrior(bounds))
     report = diagnose(system, None, logs(said, seed=1), effects=SOME)
     assert report.effects[0].name == name
     assert report.effects[0].strength == pytest.approx(size, rel=within)
@@ -102,13 +75,13 @@ def test_what_is_between_rotor_and_link_is_named_with_its_size(name, shaft, with
 
 
 def test_the_damping_of_a_shaft_is_fitted_in_any_case():
-    shift = _Shift(units_of([effect("series_elasticity")], robot_of(one_body()))[0], "damping",
+    shift = _Shift(units_of([effect("series_elasticity")], robot_of(described()))[0], "damping",
                    0.01, 0.01, 0.9)  # fmt: skip
     assert shift.paid([shift.unit])
 
 
 def test_a_search_counts_the_compliance_of_a_shaft_by_its_period():
-    (unit,) = units_of([effect("series_elasticity")], robot_of(one_body()))
+    (unit,) = units_of([effect("series_elasticity")], robot_of(described()))
     assert unit.actual(unit.high) == pytest.approx(unit.high)  # 2 Hz
     assert unit.actual(0.1 * unit.high) == pytest.approx(0.01 * unit.high)  # 20 Hz
     assert unit.actual(0.0) == 0.0
@@ -117,7 +90,7 @@ def test_a_search_counts_the_compliance_of_a_shaft_by_its_period():
 
 
 def test_what_is_not_known_of_a_compliance_is_not_nothing_at_zero():
-    (unit,) = units_of([effect("series_elasticity")], robot_of(one_body()))
+    (unit,) = units_of([effect("series_elasticity")], robot_of(described()))
     rng = np.random.default_rng(0)
     jacobian = rng.normal(size=(400, 2)) * 5.0
     errors = [
@@ -131,5 +104,5 @@ def test_what_is_not_known_of_a_compliance_is_not_nothing_at_zero():
 
 
 def test_fits_reach_as_far_as_the_prior_that_a_report_offers():
-    (unit,) = units_of([effect("series_elasticity")], robot_of(one_body()))
+    (unit,) = units_of([effect("series_elasticity")], robot_of(described()))
     assert unit.actual(unit.inside(np.inf)) == pytest.approx(2 * unit.high)
