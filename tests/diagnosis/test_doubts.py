@@ -14,6 +14,7 @@ from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.divergence import diverges_throughout
 from torchrl_bayessim.diagnosis.doubts import alike, doubts, numerical
 from torchrl_bayessim.diagnosis.objective import Point, units_of
+from torchrl_bayessim.diagnosis.refit import Fit
 from torchrl_bayessim.diagnosis.report import Finding
 from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
 from torchrl_bayessim.diagnosis.verdict import _Weighed
@@ -140,7 +141,7 @@ def test_places_of_one_effect_share_its_credit_by_what_each_changes():
     jacobian = np.zeros((10, 2))
     jacobian[:5, 0], jacobian[5:, 1] = 1.0, 2.0
     strengths = {units[0]: units[0].high, units[1]: units[1].high}
-    fit = SimpleNamespace(jacobian=jacobian, point=Point(np.zeros(0), strengths), units=units)
+    fit = Fit(Point(np.zeros(0), strengths), tuple(units), np.zeros((5, 2)), jacobian)
     selection = SimpleNamespace(best=SimpleNamespace(fit=fit))
     credit = unit_credit(selection, {"coulomb_friction": 0.5})
     assert [credit[unit] for unit in units] == pytest.approx([0.1, 0.4])
