@@ -44,23 +44,45 @@ def test_networks_fitted_at_once_are_those_fitted_one_by_one(
         torch.testing.assert_close(got, expected, atol=2e-3, rtol=2e-3)
 
 
+def gradients_of(stacked, networks):
+    """Yield the gradient of each parameter of each network, by hand and by autograd."""
+    sizes = [len(networks) * parameter.numel() for parameter in networks[0].parameters()]
+    parts = stacked.parameters[0].grad.split(sizes)
+    for part, *own in zip(parts, *(net.parameters() for net in networks), strict=True):
+        for row, parameter in zip(part.view(len(networks), -1), own, strict=True):
+            yield row, parameter.grad.flatten()
+
+
+@pytest.mark.parametrize("features", ["residual", "neural"])
+def test_gradients_by_hand_are_those_of_autograd(features):
+    networks = [posterior.network for posterior in posteriors(features=features)]
+    x = torch.randn(3, 8, 2, generator=generator("x"))
+    stacked = StackedNetworks(networks)
+    raw = stacked.raw(x)
+    upstream = torch.randn(raw.shape, generator=generator("upstream"))
+    stacked.backpropagate(upstream)
+    for network, own, values, gradient in zip(networks, x, raw, upstream, strict=True):
+        expected = network.raw(own)
+        torch.testing.assert_close(values, expected)
+        expected.backward(gradient)
+    for got, expected in gradients_of(stacked, networks):
+        torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-5)
+
+
 def test_the_gradient_of_each_network_is_clipped_by_itself():
     networks = [posterior.network for posterior in posteriors()[:2]]
     x = torch.randn(2, 8, 2, generator=generator("x"))
     stacked = StackedNetworks(networks)
-    weight = torch.tensor([1e3, 1e-3])
-    (stacked.mixture(x).loc.square().mean((1, 2, 3)) * weight).sum().backward()
+    upstream = torch.ones_like(stacked.raw(x)) * torch.tensor([1e2, 1e-4]).view(2, 1, 1)
+    stacked.backpropagate(upstream)
     stacked.clip_gradients(0.5)
-    for network, own, factor in zip(networks, x, weight, strict=True):
-        network.zero_grad()
-        (network.mixture(own).loc.square().mean() * factor).backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 0.5)
-    gradient = stacked.parameters[0].grad
-    assert gradient is not None
-    parts = gradient.split([2 * p.numel() for p in networks[0].parameters()])
-    for part, *own in zip(parts, *(n.parameters() for n in networks), strict=True):
-        for row, parameter in zip(part.view(2, -1), own, strict=True):
-            torch.testing.assert_close(row, parameter.grad.flatten(), rtol=1e-3, atol=1e-7)
+    norms = []
+    for network, own, gradient in zip(networks, x, upstream, strict=True):
+        network.raw(own).backward(gradient)
+        norms.append(torch.nn.utils.clip_grad_norm_(network.parameters(), 0.5))
+    assert norms[0] > 0.5 > norms[1]
+    for got, expected in gradients_of(stacked, networks):
+        torch.testing.assert_close(got, expected, rtol=1e-3, atol=1e-7)
 
 
 @pytest.mark.parametrize("frozen", ["head", "features.first"])
@@ -130,6 +152,14 @@ def test_only_networks_that_differ_in_parameters_alone_are_stacked():
     assert not alike([first, other.network])
     again.network.head.register_forward_hook(lambda *_: None)
     assert not alike([first, again.network])
+    curved = [posterior.network for posterior in posteriors(features="neural")]
+    assert alike(curved)
+    for network in curved:
+        network.features.layers[1] = torch.nn.Tanh()
+    assert not alike(curved)
+    unbiased = posteriors()[0].network
+    unbiased.head = torch.nn.Linear(96, sum(unbiased.sizes), bias=False)
+    assert not alike([unbiased])
     assert not alike([first, first])
     assert not alike([first, posteriors()[0].network.double()])
     fourier = posteriors(features=FourierFeatures(2))

@@ -10,7 +10,7 @@ from __future__ import annotations
 __all__ = ["descend"]
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import count
 from typing import NamedTuple
 
@@ -21,15 +21,17 @@ from tqdm.auto import tqdm
 
 from ..errors import SimulationError, message
 from ..randomness import generator
-from .posterior import MixtureDensityPosterior, in_training
+from .mixture_gradients import log_density_and_gradient
+from .posterior import TRAINING_POINTS, MixtureDensityPosterior, in_training
 from .rows import Rows
 from .stacked import OneNetwork, StackedNetworks, as_one
 from .weights import weights_of
 
 _WARM_UP = 0.1  # share of the steps in which the learning rate rises
-_FREE = 0.7  # share of the epochs that do without the box
+_FREE = 0.6  # share of the epochs that do without the box
 _CLIP = 10.0  # of the gradient's norm
 _BETAS = 0.9, 0.95  # squares of gradients are forgotten within a fit of some hundred steps
+_GATHERED = 64  # minibatches of which the pairs are gathered at once
 
 
 class _Pairs(NamedTuple):
@@ -89,16 +91,21 @@ def descend(
         for epoch in bar:
             if not truncated and (epoch >= min(_FREE * epochs, epochs - 1) or stale >= patience):
                 truncated, stale = True, 0
+            box = first.prior.box if truncated else None
             order = torch.stack([torch.randperm(len(train), generator=g) for g in shuffles])
-            total = torch.zeros(size)
-            for rows in order.chunk(batches, 1):
-                loss = _loss(first, networks, pairs(rows), truncated=truncated)
-                total += _checked(loss).detach().cpu() * (rows.shape[1] / len(train))
-                loss.sum().backward()
+            total = torch.zeros(size, dtype=torch.float64, device=held.z.device)
+            for batch in _minibatches(pairs, order, batches):
+                raw = networks.raw(batch.scaled)
+                log_q, gradient = log_density_and_gradient(
+                    first.network, raw, batch.z, box=box, points=TRAINING_POINTS
+                )
+                share = batch.weight / batch.weight.sum(-1, keepdim=True)
+                networks.backpropagate(-share.unsqueeze(-1) * gradient)
                 step()
-            with torch.no_grad():
-                held_out = _loss(first, networks, held, truncated=True).cpu()
-            trace.append((total, held_out))
+                loss = ((batch.volume - log_q) * share).sum(-1)
+                total += loss * (batch.z.shape[1] / len(train))
+            held_out = _loss(first, networks, held).cpu()
+            trace.append((_checked(total.cpu()), _checked(held_out)))
             bar.set_postfix(train=f"{total.mean():.2f}", held_out=f"{held_out.mean():.2f}")
             better, stale = held_out < best - 1e-4, stale + 1
             if better.any():
@@ -115,7 +122,7 @@ def descend(
 def _stepper(
     networks: OneNetwork | StackedNetworks, steps: int, *, lr: float, weight_decay: float
 ) -> Callable[[], None]:
-    """Return what makes a step down the gradients, and forgets them."""
+    """Return what makes a step down the gradients."""
     optimizer = torch.optim.AdamW(
         networks.parameters, lr=lr, betas=_BETAS, weight_decay=weight_decay, fused=True
     )
@@ -125,7 +132,6 @@ def _stepper(
         networks.clip_gradients(_CLIP)
         optimizer.param_groups[0]["lr"] = lr * _rate(next(counted), steps)
         optimizer.step()
-        networks.zero_gradients()
 
     return step
 
@@ -159,16 +165,23 @@ def _prepared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> _Pai
     return _Pairs(scaled, z, volume, weights_of(pairs).to(z))
 
 
+def _minibatches(
+    pairs: Callable[[Tensor], _Pairs], order: Tensor, batches: int
+) -> Iterator[_Pairs]:
+    """Yield pairs in ``order``, ``(M, N)``, in parts as even as `Tensor.chunk` makes them."""
+    size = math.ceil(order.shape[1] / batches)
+    for rows in order.split(_GATHERED * size, 1):
+        gathered = pairs(rows)
+        yield from map(_Pairs, *(value.split(size, 1) for value in gathered))
+
+
+@torch.no_grad()
 def _loss(
-    posterior: MixtureDensityPosterior,
-    networks: OneNetwork | StackedNetworks,
-    pairs: _Pairs,
-    *,
-    truncated: bool,
+    posterior: MixtureDensityPosterior, networks: OneNetwork | StackedNetworks, pairs: _Pairs
 ) -> Tensor:
     """Return each network's weighted negative log-density in nats, as `PosteriorLoss` does."""
-    mixture = in_training(posterior, networks.mixture(pairs.scaled), truncated=truncated)
-    log_q = mixture.formula(pairs.z)
+    mixture = posterior.network.widened(networks.raw(pairs.scaled), posterior.network.widening)
+    log_q = in_training(posterior, mixture).formula(pairs.z)
     return ((pairs.volume - log_q) * pairs.weight).sum(-1) / pairs.weight.sum(-1)
 
 

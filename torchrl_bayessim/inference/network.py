@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["Covariance", "MixtureDensityNetwork", "melu"]
+__all__ = ["Covariance", "MixtureDensityNetwork", "factor", "melu"]
 
 from collections.abc import Iterable
 from typing import Any, Literal
@@ -134,18 +134,40 @@ class MixtureDensityNetwork(nn.Module):
 
     def widened(self, raw: Tensor, widening: Tensor) -> Mixture:
         """Return the mixture of :meth:`raw` values with these factors on deviations, ``(D,)``."""
-        logits, loc, diagonal, lower = raw.split(self.sizes, -1)
-        shape = (*raw.shape[:-1], self.components, self.parameters_)
-        loc = self.reach * torch.tanh(loc.reshape(shape) / self.reach)
-        deviation = widening * melu(diagonal.reshape(shape)).sqrt()
+        logits, loc, deviation, slope = self.parts(raw, widening)
+        return Mixture(logits, loc, factor(deviation, slope))
+
+    def parts(self, raw: Tensor, widening: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return logits ``(*, K)``, means and deviations ``(*, K, D)``, slopes of :func:`factor`.
+
+        The slopes are of shape ``(*, K, D (D - 1) / 2)``, or ``(*, K, 0)`` without correlations.
+        """
+        logits, loc, diagonal, slope = raw.split(self.sizes, -1)
+        each = (*raw.shape[:-1], self.components)
+        loc = self.reach * torch.tanh(loc.reshape(*each, self.parameters_) / self.reach)
+        deviation = widening * melu(diagonal.reshape(*each, self.parameters_)).sqrt()
         deviation = WIDEST * torch.tanh(deviation / WIDEST)
-        if self.parameters_ == 1:
-            return Mixture(logits, loc, deviation.unsqueeze(-1))
-        rows = torch.diag_embed(torch.ones_like(deviation))
-        if self.covariance == "full":
-            below = torch.tril_indices(self.parameters_, self.parameters_, -1)
-            slope = lower.reshape(*shape[:-1], -1)
-            rows[..., below[0], below[1]] = STEEPEST * torch.tanh(slope / STEEPEST)
-            # unit rows: the network sets marginal deviations and correlations separately
-            rows = rows / rows.norm(dim=-1, keepdim=True)
-        return Mixture(logits, loc, deviation.unsqueeze(-1) * rows)
+        slope = slope.reshape(*each, self.sizes[-1] // self.components)
+        return logits, loc, deviation, STEEPEST * torch.tanh(slope / STEEPEST)
+
+
+def factor(deviation: Tensor, slope: Tensor) -> Tensor:
+    """Return Cholesky factors ``(*, D, D)`` of marginal deviations ``(*, D)``.
+
+    The network sets them and the correlations separately: row d of the factor is that of
+    ``slope``, ``(*, D (D - 1) / 2)`` by rows, and 1 on the diagonal, scaled to norm 1 and then to
+    the deviation. Without slopes it is diagonal.
+
+    Example:
+        >>> factor(torch.tensor([1.0, 2.0]), torch.tensor([0.75]))
+        tensor([[1.0000, 0.0000],
+                [1.2000, 1.6000]])
+    """
+    if deviation.shape[-1] == 1:
+        return deviation.unsqueeze(-1)
+    rows = torch.diag_embed(torch.ones_like(deviation))
+    if slope.shape[-1]:
+        below = torch.tril_indices(rows.shape[-1], rows.shape[-1], -1)
+        rows[..., below[0], below[1]] = slope
+        rows = rows / rows.norm(dim=-1, keepdim=True)
+    return deviation.unsqueeze(-1) * rows

@@ -13,7 +13,7 @@ simulators", arXiv:1906.01728, eq. 9-13). Nothing leaks outside the box and noth
 
 from __future__ import annotations
 
-__all__ = ["MixtureDensityPosterior", "in_training"]
+__all__ = ["TRAINING_POINTS", "MixtureDensityPosterior", "in_training"]
 
 import warnings
 from functools import partial
@@ -42,7 +42,7 @@ from .truncation import POINTS, TruncatedGaussianMixture
 
 Pooling = Literal["product", "mean"]
 MAPS = {"residual": ResidualFeatures, "neural": NeuralFeatures, "fourier": FourierFeatures}
-TRAINING_POINTS = 16  # for the mass of correlated components while the loss is minimised
+TRAINING_POINTS = 8  # for the mass of correlated components while the loss is minimised
 
 
 class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
@@ -271,13 +271,11 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         return repr(self.prior)
 
 
-def in_training(
-    posterior: MixtureDensityPosterior, mixture: Mixture, *, truncated: bool = True
-) -> TruncatedGaussianMixture:
+def in_training(posterior: MixtureDensityPosterior, mixture: Mixture) -> TruncatedGaussianMixture:
     """Return what a network's mixture stands for while it is fitted: its mass is coarse."""
     return TruncatedGaussianMixture(
         *mixture,
-        posterior.prior.box if truncated else None,
+        posterior.prior.box,
         diagonal=posterior.network.covariance == "diagonal",
         points=TRAINING_POINTS,
     )

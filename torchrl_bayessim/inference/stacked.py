@@ -1,7 +1,8 @@
 """Networks of one shape as one: every product of their matrices is one batched product.
 
 On a processor a step of a small network takes as long as its hundred small operations take to be
-called. Several networks in one graph call them once.
+called. Several networks at once call them once, and their gradient is worked out by hand, because
+to record and replay a graph takes as long again.
 """
 
 from __future__ import annotations
@@ -9,23 +10,20 @@ from __future__ import annotations
 __all__ = ["OneNetwork", "StackedNetworks", "alike", "as_one"]
 
 import copy
-from collections.abc import Sequence
-from typing import cast
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
+from torch.nn.functional import silu
+from torch.nn.utils import parameters_to_vector
 
 from .features import NeuralFeatures, ResidualFeatures
-from .mixtures import Mixture
 from .network import MixtureDensityNetwork
-
-_OF_LINEAR_LAYERS = ResidualFeatures, NeuralFeatures
 
 
 def as_one(networks: Sequence[MixtureDensityNetwork]) -> OneNetwork | StackedNetworks:
     """Return what is trained in the place of networks that are :func:`alike`, or of one."""
-    return OneNetwork(networks[0]) if len(networks) == 1 else StackedNetworks(networks)
+    return StackedNetworks(networks) if alike(networks) else OneNetwork(networks[0])
 
 
 class OneNetwork:
@@ -38,20 +36,25 @@ class OneNetwork:
     def __init__(self, network: MixtureDensityNetwork) -> None:
         self._network = network
         self.parameters = list(network.parameters())
+        self._raw: Tensor | None = None
         self._kept = copy.deepcopy(network.state_dict())
 
-    def mixture(self, scaled: Tensor) -> Mixture:
-        """Return the mixtures for standardised inputs, of shape ``(1, B, L)``."""
-        return Mixture(*(part.unsqueeze(0) for part in self._network.mixture(scaled[0])))
+    def raw(self, scaled: Tensor) -> Tensor:
+        """Return the last layer's values for standardised inputs ``(1, B, L)``, ``(1, B, P)``."""
+        raw = self._network.raw(scaled[0])
+        self._raw = raw if raw.requires_grad else None
+        return raw.detach().unsqueeze(0)
+
+    def backpropagate(self, gradient: Tensor) -> None:
+        """Set the parameters' gradients from the one by what :meth:`raw` returned last."""
+        for parameter in self.parameters:
+            parameter.grad = None
+        if self._raw is not None:  # or all is frozen
+            self._raw.backward(gradient[0].to(self._raw))
 
     def clip_gradients(self, largest: float) -> None:
         """Scale the gradient down to a norm of at most ``largest``."""
         nn.utils.clip_grad_norm_(self.parameters, largest)
-
-    def zero_gradients(self) -> None:
-        """Forget the gradients."""
-        for parameter in self.parameters:
-            parameter.grad = None
 
     def keep(self, which: Tensor) -> None:
         """Remember the present state, if ``which``, of shape ``(1,)``, says so."""
@@ -70,8 +73,7 @@ class StackedNetworks:
         networks: Stay as they are until :meth:`restore`.
 
     Attributes:
-        parameters: One tensor, of all parameters that are not frozen, and their gradient, which
-            adds up.
+        parameters: One tensor, of all parameters that are not frozen, and their gradient.
 
     Example:
         >>> one, other = (
@@ -80,35 +82,52 @@ class StackedNetworks:
         ...     for seed in (0, 1)
         ... )
         >>> x = torch.ones(2, 5, 3)
-        >>> together = StackedNetworks([one, other]).mixture(x)
-        >>> torch.allclose(together.loc[1], other.mixture(x[1]).loc, atol=1e-6)
+        >>> together = StackedNetworks([one, other]).raw(x)
+        >>> torch.allclose(together[1], other.raw(x[1]), atol=1e-6)
         True
     """
 
     def __init__(self, networks: Sequence[MixtureDensityNetwork]) -> None:
         self._networks = networks
-        self._module = copy.deepcopy(networks[0])
-        for name, layer in list(self._module.named_modules()):
-            if isinstance(layer, nn.Linear):
-                layers = [cast("nn.Linear", n.get_submodule(name)) for n in networks]
-                self._module.set_submodule(name, _StackedLinear(layers))
+        self._residual = isinstance(networks[0].features, ResidualFeatures)
         # one tensor for whoever makes steps, and views of it for the layers
-        self._layers = _learned(self._module)
-        whole = nn.Parameter(parameters_to_vector(self._layers).detach())
-        self.parameters, self._gradient = [whole], torch.zeros_like(whole)
-        whole.grad, self._kept = self._gradient, whole.detach().clone()
-        vector_to_parameters(whole.data, self._layers)
-        for layer, part in zip(self._layers, self._parts(self._gradient), strict=True):
-            layer.grad = part.view(layer.shape)
+        learned = [torch.stack(each) for each in zip(*map(_learned, networks), strict=True)]
+        self._sizes = [each.numel() for each in learned]
+        whole = nn.Parameter(parameters_to_vector(learned).detach())
+        whole.grad = torch.zeros_like(whole)
+        self.parameters, self._gradient = [whole], whole.grad
+        self._kept = whole.detach().clone()
+        views = iter(zip(self._parts(whole.detach()), self._parts(self._gradient), strict=True))
+        *self._hidden, self._head = (
+            _StackedLinear(
+                *(_Stacked([getattr(layer, name) for layer in layers], views) for name in _OF_LAYER)
+            )
+            for layers in zip(*map(_layers, networks), strict=True)
+        )
 
     def _parts(self, values: Tensor) -> list[Tensor]:
         """Return views of all parameters, or of as many values, by layer, ``(M, P_i)`` each."""
-        sizes = [layer.numel() for layer in self._layers]
-        return [part.view(len(self._networks), -1) for part in values.split(sizes)]
+        return [part.view(len(self._networks), -1) for part in values.split(self._sizes)]
 
-    def mixture(self, scaled: Tensor) -> Mixture:
-        """Return the mixtures for standardised inputs, those of each network, ``(M, B, L)``."""
-        return self._module.mixture(scaled)
+    @torch.no_grad()
+    def raw(self, scaled: Tensor) -> Tensor:
+        """Return the last layers' values for standardised inputs ``(M, B, L)``, ``(M, B, P)``."""
+        hidden = scaled
+        for i, layer in enumerate(self._hidden):
+            before, hidden = hidden, silu(layer(hidden))
+            if i and self._residual:
+                hidden = before + hidden
+        return self._head(hidden)
+
+    @torch.no_grad()
+    def backpropagate(self, gradient: Tensor) -> None:
+        """Set the parameters' gradient from the one by what :meth:`raw` returned last."""
+        hidden = self._head.backward(gradient.to(self._gradient))
+        for i in reversed(range(len(self._hidden))):
+            layer = self._hidden[i]
+            after, hidden = hidden, layer.backward(_silu_backward(hidden, layer.values), last=not i)
+            if i and self._residual:
+                hidden += after
 
     def clip_gradients(self, largest: float) -> None:
         """Scale the gradient of each network down to a norm of at most ``largest``."""
@@ -119,10 +138,6 @@ class StackedNetworks:
         share = (largest / norm).clamp(max=1.0).unsqueeze(1)
         for part in parts:
             part.mul_(share)
-
-    def zero_gradients(self) -> None:
-        """Set the gradients to zero, in place: those of the layers are views."""
-        self._gradient.zero_()
 
     @torch.no_grad()
     def keep(self, which: Tensor) -> None:
@@ -140,46 +155,92 @@ class StackedNetworks:
                 layer.copy_(part[row].view_as(layer))
 
 
-def _learned(module: nn.Module) -> list[nn.Parameter]:
-    return [parameter for parameter in module.parameters() if parameter.requires_grad]
+class _Stacked:
+    """One parameter of M layers: the next views of all, or a copy without gradient if frozen."""
+
+    def __init__(
+        self, parameters: Sequence[nn.Parameter], views: Iterator[tuple[Tensor, Tensor]]
+    ) -> None:
+        shape = (len(parameters), *parameters[0].shape)
+        self.gradient: Tensor | None = None
+        if parameters[0].requires_grad:
+            value, gradient = next(views)
+            self.value, self.gradient = value.view(shape), gradient.view(shape)
+        else:
+            self.value = torch.stack([parameter.detach() for parameter in parameters])
 
 
-class _StackedLinear(nn.Module):
-    def __init__(self, layers: Sequence[nn.Linear]) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.stack([layer.weight.detach() for layer in layers]))
-        self.bias = nn.Parameter(torch.stack([layer.bias.detach() for layer in layers]))
-        for mine, its in ((self.weight, layers[0].weight), (self.bias, layers[0].bias)):
-            mine.requires_grad_(its.requires_grad)
+class _StackedLinear:
+    """M linear layers; ``values`` are what they returned last."""
 
-    def forward(self, x: Tensor) -> Tensor:
-        return torch.baddbmm(self.bias.unsqueeze(1), x, self.weight.mT)
+    def __init__(self, weight: _Stacked, bias: _Stacked) -> None:
+        self.weight, self.bias = weight, bias
+        self.inputs = self.values = weight.value
+
+    def __call__(self, inputs: Tensor) -> Tensor:
+        self.inputs = inputs
+        self.values = torch.baddbmm(self.bias.value.unsqueeze(1), inputs, self.weight.value.mT)
+        return self.values
+
+    def backward(self, gradient: Tensor, *, last: bool = False) -> Tensor:
+        """Set the gradients from the one by the values, and return that by the inputs."""
+        if self.weight.gradient is not None:
+            torch.bmm(gradient.mT, self.inputs, out=self.weight.gradient)
+        if self.bias.gradient is not None:
+            torch.sum(gradient, 1, out=self.bias.gradient)
+        return gradient if last else gradient @ self.weight.value
+
+
+_OF_LAYER = "weight", "bias"
+_silu_backward = torch.ops.aten.silu_backward  # what autograd calls
+
+
+def _layers(network: MixtureDensityNetwork) -> list[nn.Linear]:
+    """Return the linear layers, the head last, of a network that has no others.
+
+    Empty if it is anything else than a chain of them, each with SiLU behind it but the last.
+    """
+    features = network.features
+    if type(features) is ResidualFeatures:
+        hidden = [features.first, *features.blocks.children()]
+    elif type(features) is NeuralFeatures:
+        chain = list(features.layers.children())
+        hidden, between = chain[::2], chain[1::2]
+        if len(between) < len(hidden) or any(type(layer) is not nn.SiLU for layer in between):
+            return []
+    else:
+        return []
+    layers = [layer for layer in [*hidden, network.head] if type(layer) is nn.Linear]
+    whole = len(layers) == len(hidden) + 1 and all(layer.bias is not None for layer in layers)
+    return layers if whole else []
+
+
+def _learned(network: MixtureDensityNetwork) -> list[nn.Parameter]:
+    named = (getattr(layer, name) for layer in _layers(network) for name in _OF_LAYER)
+    return [parameter for parameter in named if parameter.requires_grad]
 
 
 def alike(networks: Sequence[MixtureDensityNetwork]) -> bool:
-    """Return whether networks differ in the weights of their linear layers only."""
-    if any(type(network.features) not in _OF_LINEAR_LAYERS for network in networks):
+    """Return whether networks differ in the weights of their linear layers only.
+
+    They are chains of linear layers with SiLU between them, as the default ones.
+    """
+    if not all(_layers(network) and _learned(network) for network in networks):
         return False
-    if any(not _of_linear_layers(network) for network in networks):
+    if any(_hooked(network) for network in networks):
         return False
     parameters = {id(p) for network in networks for p in network.parameters()}
-    if len(parameters) < sum(len(list(network.parameters())) for network in networks):
+    if len(parameters) < sum(2 * len(_layers(network)) for network in networks):
         return False  # some are shared
     first = _settings(networks[0])
     return all(_settings(network) == first for network in networks)
 
 
-def _of_linear_layers(network: MixtureDensityNetwork) -> bool:
-    """Return whether nothing but linear layers has parameters, buffers or hooks."""
-    for module in network.modules():
-        plain = type(module) is nn.Linear or module is network
-        if not plain and next(module.parameters(recurse=False), None) is not None:
-            return False
-        if module is not network and next(module.buffers(recurse=False), None) is not None:
-            return False
-        if module._forward_hooks or module._forward_pre_hooks or module._backward_hooks:
-            return False
-    return True
+def _hooked(network: MixtureDensityNetwork) -> bool:
+    return any(
+        module._forward_hooks or module._forward_pre_hooks or module._backward_hooks
+        for module in network.modules()
+    )
 
 
 def _settings(network: MixtureDensityNetwork) -> tuple[object, ...]:
