@@ -1,10 +1,9 @@
-import math
 
 import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_bayessim.inference.descent import _rate, descend
+from torchrl_bayessim.inference.descent import descend
 from torchrl_bayessim.inference.losses import PosteriorLoss
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
@@ -69,14 +68,3 @@ def test_the_box_comes_in_before_the_end():
     descend([net], data[:1500], data[1500:], epochs=16, **OPTIONS)
     density = net.distribution(torch.zeros(2)).log_prob(torch.tensor([[0.0], [0.5], [1.0]]))
     assert density.abs().max() < 0.3  # one Gaussian without the box: 1.1 apart
-
-
-def test_the_learning_rate_rises_once_and_falls_to_nothing():
-    rates = [_rate(step, 200) for step in range(200)]
-    top = rates.index(max(rates))
-    assert top == 20
-    assert max(rates) == pytest.approx(1.0)
-    assert rates[:top] == sorted(rates[:top])
-    assert rates[top:] == sorted(rates[top:], reverse=True)
-    assert rates[-1] < 1e-3
-    assert all(math.isfinite(_rate(step, 1)) for step in range(3))

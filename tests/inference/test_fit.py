@@ -175,7 +175,7 @@ def test_parameters_that_are_not_finite_are_not_blamed_on_simulations():
         short_fit(posterior(), data)
 
 
-@pytest.mark.parametrize("options", [{"lr": 0.1, "epochs": 12}, {"epochs": 20, "patience": 2}])
+@pytest.mark.parametrize("options", [{"lr": 0.1, "epochs": 20}, {"epochs": 20, "patience": 2}])
 def test_the_parameters_of_the_best_epoch_are_kept(options):
     net, data = posterior(), linear_gaussian(60)
     report = short_fit(net, data, **{"lr": 0.05, "batch_size": 16} | options)

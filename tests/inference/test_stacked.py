@@ -1,6 +1,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torch.optim.adamw import adamw
 
 from torchrl_bayessim.inference.descent import descend
 from torchrl_bayessim.inference.features import Features, FourierFeatures, NeuralFeatures
@@ -45,12 +46,9 @@ def test_networks_fitted_at_once_are_those_fitted_one_by_one(
 
 
 def gradients_of(stacked, networks):
-    """Yield the gradient of each parameter of each network, by hand and by autograd."""
-    sizes = [len(networks) * parameter.numel() for parameter in networks[0].parameters()]
-    parts = stacked.parameters[0].grad.split(sizes)
-    for part, *own in zip(parts, *(net.parameters() for net in networks), strict=True):
-        for row, parameter in zip(part.view(len(networks), -1), own, strict=True):
-            yield row, parameter.grad.flatten()
+    """Yield the gradient of all parameters of each network, by hand and by autograd."""
+    for row, network in zip(stacked.gradients[0], networks, strict=True):
+        yield row, torch.cat([parameter.grad.flatten() for parameter in network.parameters()])
 
 
 @pytest.mark.parametrize("features", ["residual", "neural"])
@@ -192,17 +190,16 @@ def test_one_seed_for_several_is_refused():
 def test_an_interrupted_fit_leaves_each_network_at_its_best_epoch(count, monkeypatch):
     data, steps = pairs(), []
 
-    class Interrupted(torch.optim.AdamW):
-        def step(self, closure=None):
-            steps.append(1)
-            if len(steps) == 12:  # in the third epoch, of five steps each
-                raise KeyboardInterrupt
-            return super().step(closure)
+    def interrupted(*args, **kwargs):
+        steps.append(1)
+        if len(steps) == 12:  # in the third epoch, of five steps each
+            raise KeyboardInterrupt
+        adamw(*args, **kwargs)
 
     options = {"batch_size": 60, "epochs": 9, "progress": False}
     seeds = list(range(count))
     whole, broken = posteriors()[:count], posteriors()[:count]
-    monkeypatch.setattr(torch.optim, "AdamW", Interrupted)
+    monkeypatch.setattr("torchrl_bayessim.inference.steps.adamw", interrupted)
     with pytest.raises(KeyboardInterrupt):
         fit_several(broken, data, seeds=seeds, **options)
     monkeypatch.undo()

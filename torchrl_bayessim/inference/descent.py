@@ -11,26 +11,24 @@ __all__ = ["descend"]
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from itertools import count
 from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn.functional import pad
 from tqdm.auto import tqdm
 
 from ..errors import SimulationError, message
 from ..randomness import generator
-from .mixture_gradients import log_density_and_gradient
-from .posterior import TRAINING_POINTS, MixtureDensityPosterior, in_training
+from .mixture_gradients import log_density_and_pullback
+from .posterior import TRAINING_POINTS, MixtureDensityPosterior
 from .rows import Rows
 from .stacked import OneNetwork, StackedNetworks, as_one
+from .steps import Steps
 from .weights import weights_of
 
-_WARM_UP = 0.1  # share of the steps in which the learning rate rises
 _FREE = 0.6  # share of the epochs that do without the box
-_CLIP = 10.0  # of the gradient's norm
-_BETAS = 0.9, 0.95  # squares of gradients are forgotten within a fit of some hundred steps
 _GATHERED = 64  # minibatches of which the pairs are gathered at once
 
 
@@ -80,8 +78,9 @@ def descend(
     networks = as_one([posterior.network for posterior in posteriors])
     pairs, held = _reader(first, train), _prepared(first, validation)
     held = _Pairs(*(value.expand(size, *value.shape) for value in held))
-    batches = math.ceil(len(train) / batch_size)
-    step = _stepper(networks, epochs * batches, lr=lr, weight_decay=weight_decay)
+    length = math.ceil(len(train) / math.ceil(len(train) / batch_size))
+    batches = math.ceil(len(train) / length)
+    step = Steps(networks, epochs * batches, lr=lr, weight_decay=weight_decay)
     shuffles = [generator(seed, "minibatches") for seed in seeds]
     best = torch.full((size,), math.inf)
     truncated, stale = first.prior.box is None, 0
@@ -91,19 +90,18 @@ def descend(
         for epoch in bar:
             if not truncated and (epoch >= min(_FREE * epochs, epochs - 1) or stale >= patience):
                 truncated, stale = True, 0
-            box = first.prior.box if truncated else None
             order = torch.stack([torch.randperm(len(train), generator=g) for g in shuffles])
-            total = torch.zeros(size, dtype=torch.float64, device=held.z.device)
-            for batch in _minibatches(pairs, order, batches):
-                raw = networks.raw(batch.scaled)
-                log_q, gradient = log_density_and_gradient(
-                    first.network, raw, batch.z, box=box, points=TRAINING_POINTS
-                )
-                share = batch.weight / batch.weight.sum(-1, keepdim=True)
-                networks.backpropagate(-share.unsqueeze(-1) * gradient)
-                step()
-                loss = ((batch.volume - log_q) * share).sum(-1)
-                total += loss * (batch.z.shape[1] / len(train))
+            total = (
+                torch.stack(
+                    [
+                        _learn(
+                            first, networks, pairs(rows), step, length=length, truncated=truncated
+                        )
+                        for rows in order.split(_GATHERED * length, 1)
+                    ]
+                ).sum(0)
+                / batches
+            )
             held_out = _loss(first, networks, held).cpu()
             trace.append((_checked(total.cpu()), _checked(held_out)))
             bar.set_postfix(train=f"{total.mean():.2f}", held_out=f"{held_out.mean():.2f}")
@@ -119,29 +117,26 @@ def descend(
     return list(zip(learned, held_out, strict=True))
 
 
-def _stepper(
-    networks: OneNetwork | StackedNetworks, steps: int, *, lr: float, weight_decay: float
-) -> Callable[[], None]:
-    """Return what makes a step down the gradients."""
-    optimizer = torch.optim.AdamW(
-        networks.parameters, lr=lr, betas=_BETAS, weight_decay=weight_decay, fused=True
-    )
-    counted = count()
-
-    def step() -> None:
-        networks.clip_gradients(_CLIP)
-        optimizer.param_groups[0]["lr"] = lr * _rate(next(counted), steps)
-        optimizer.step()
-
-    return step
-
-
-def _rate(step: int, steps: int) -> float:
-    """Return the share of the highest learning rate."""
-    rise = max(1.0, _WARM_UP * steps)
-    if step < rise:
-        return 0.1 + 0.9 * step / rise
-    return 0.5 * (1 + math.cos(math.pi * min(1.0, (step - rise) / max(1.0, steps - rise))))
+def _learn(
+    posterior: MixtureDensityPosterior,
+    networks: OneNetwork | StackedNetworks,
+    pairs: _Pairs,
+    step: Callable[[], None],
+    *,
+    length: int,
+    truncated: bool,
+) -> Tensor:
+    """Make a step for every minibatch; return the sum of their losses, of each network."""
+    network, box = posterior.network, posterior.prior.box if truncated else None
+    share = _shares(pairs.weight, length)
+    log_q: list[Tensor] = []
+    for scaled, z, own in _minibatches(pairs.scaled, pairs.z, -share, length=length):
+        raw = networks.raw(scaled)
+        found, pullback = log_density_and_pullback(network, raw, z, box=box, points=TRAINING_POINTS)
+        networks.backpropagate(pullback(own))
+        step()
+        log_q.append(found)
+    return ((pairs.volume - torch.cat(log_q, 1)) * share).sum(-1)
 
 
 def _reader(
@@ -165,23 +160,25 @@ def _prepared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> _Pai
     return _Pairs(scaled, z, volume, weights_of(pairs).to(z))
 
 
-def _minibatches(
-    pairs: Callable[[Tensor], _Pairs], order: Tensor, batches: int
-) -> Iterator[_Pairs]:
-    """Yield pairs in ``order``, ``(M, N)``, in parts as even as `Tensor.chunk` makes them."""
-    size = math.ceil(order.shape[1] / batches)
-    for rows in order.split(_GATHERED * size, 1):
-        gathered = pairs(rows)
-        yield from map(_Pairs, *(value.split(size, 1) for value in gathered))
+def _shares(weight: Tensor, length: int) -> Tensor:
+    """Return weights ``(M, N)`` that sum to 1 in every minibatch."""
+    parts = pad(weight, (0, -weight.shape[1] % length)).unflatten(1, (-1, length))
+    return (parts / parts.sum(-1, keepdim=True)).flatten(1)[:, : weight.shape[1]]
 
 
-@torch.no_grad()
+def _minibatches(*values: Tensor, length: int) -> Iterator[tuple[Tensor, ...]]:
+    return zip(*(value.split(length, 1) for value in values), strict=True)
+
+
 def _loss(
     posterior: MixtureDensityPosterior, networks: OneNetwork | StackedNetworks, pairs: _Pairs
 ) -> Tensor:
     """Return each network's weighted negative log-density in nats, as `PosteriorLoss` does."""
-    mixture = posterior.network.widened(networks.raw(pairs.scaled), posterior.network.widening)
-    log_q = in_training(posterior, mixture).formula(pairs.z)
+    with torch.no_grad():
+        raw = networks.raw(pairs.scaled)
+    log_q, _ = log_density_and_pullback(
+        posterior.network, raw, pairs.z, box=posterior.prior.box, points=TRAINING_POINTS
+    )
     return ((pairs.volume - log_q) * pairs.weight).sum(-1) / pairs.weight.sum(-1)
 
 

@@ -6,47 +6,54 @@ With responsibilities :math:`r_k = \pi_k (N_k / Z_k) / \sum_j \pi_j (N_j / Z_j)`
     \nabla \log q = \sum_k r_k (\nabla \log \pi_k + \nabla \log N_k - \nabla \log Z_k)
 
 (Bishop, 1994, "Mixture density networks", eq. 36-39, there for Gaussians without a box). As
-autograd records them, its hundred small operations take several times as long as the network.
+autograd records them, its hundred small operations take several times as long as the network; in
+NumPy a call takes half of what it takes in torch.
 """
 
 from __future__ import annotations
 
-__all__ = ["log_density_and_gradient"]
+__all__ = ["log_density_and_pullback"]
 
 import math
 from collections.abc import Callable
+from itertools import accumulate
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from .network import FLOOR, STEEPEST, WIDEST, MixtureDensityNetwork, factor
-from .truncated_normal import log_interval_and_slopes
+from .truncated_normal import log_interval
 from .truncation import POINTS, log_mass
+
+_Array = NDArray[np.float64]
+_HALF_LOG_2_PI = 0.5 * math.log(2 * math.pi)
 
 
 class _Parts(NamedTuple):
-    """Of each component, or the gradient by it."""
+    """Of each component, or derivatives by it."""
 
-    loc: Tensor  # (*, K, D)
-    deviation: Tensor  # (*, K, D)
-    slope: Tensor  # of factor(), (*, K, D (D - 1) / 2)
-
-
-_ONE = torch.ones((), dtype=torch.float64)
-_Pull = Callable[[Tensor], _Parts]  # the gradient of a sum over components, with weights (*, K)
+    loc: _Array  # (*, K, D)
+    deviation: _Array  # (*, K, D)
+    slope: _Array  # of `factor`, (*, K, D (D - 1) / 2), or (*, K, 0) if it is diagonal
 
 
-@torch.no_grad()
-def log_density_and_gradient(
+_Pull = Callable[[_Array], _Parts]  # the gradient of a sum over components, with weights (*, K)
+
+
+def log_density_and_pullback(
     network: MixtureDensityNetwork,
     raw: Tensor,
     value: Tensor,
     *,
     box: tuple[Tensor, Tensor] | None,
     points: int = POINTS,
-) -> tuple[Tensor, Tensor]:
-    """Return log-densities of standardised parameters, and their gradients by the last layer.
+) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+    """Return log-densities of standardised parameters, and what returns their gradient.
+
+    Worked out on the processor, wherever the values are.
 
     Args:
         network: Says what its last layer's values mean.
@@ -56,32 +63,68 @@ def log_density_and_gradient(
         points: Quasi-random points that integrate the mass of a correlated component.
 
     Returns:
-        Log-densities of shape ``(*)``, and gradients of the shape of ``raw``, both float64.
+        Log-densities of shape ``(*)``, float64, and a function to be called once: from weights of
+        that shape to the gradient of the weighted sum by ``raw``, ``(*, P)``.
 
     Example:
         >>> from torchrl_bayessim.inference.features import ResidualFeatures
         >>> network = MixtureDensityNetwork(ResidualFeatures(3), 2, components=4,
         ...                                 covariance="full", reach=1.7)
         >>> raw = network.raw(torch.ones(5, 3))
-        >>> log_q, gradient = log_density_and_gradient(network, raw, torch.zeros(5, 2), box=None)
-        >>> gradient.shape == raw.shape
+        >>> log_q, pullback = log_density_and_pullback(network, raw, torch.zeros(5, 2), box=None)
+        >>> pullback(torch.ones(5)).shape == raw.shape
         True
     """
-    raw = raw.double()
-    logits, *parts = network.parts(raw, network.widening)
-    parts = _Parts(*parts)
-    log_pi = logits.log_softmax(-1)
-    log_n, pull = _gaussians(value.double(), parts)
-    if box is not None:
-        log_n, pull = _restricted(log_n, pull, _masses(parts, box, points))
-    each = log_pi + log_n
-    log_q = each.logsumexp(-1)
-    share = (each - log_q.unsqueeze(-1)).exp()
-    by_raw = _chain(network, raw, parts, pull(share))
-    return log_q, torch.cat([share - log_pi.exp(), *(part.flatten(-2) for part in by_raw)], -1)
+    values: _Array = raw.detach().double().cpu().numpy()
+    with np.errstate(all="ignore"):  # where a network diverges, its loss says so
+        parts, chain = _parts(network, values)
+        log_n, pull = _gaussians(value.double().cpu().numpy(), parts)
+        if box is not None:
+            log_n, pull = _restricted(log_n, pull, _masses(parts, box, points))
+        logits = values[..., : network.components]
+        weight, log_total = _softmax(logits)
+        share, log_q = _softmax(logits + log_n)
+
+    def pullback(upstream: Tensor) -> Tensor:
+        times = upstream.double().cpu().numpy()[..., None]
+        with np.errstate(all="ignore"):
+            by_raw = [times * (share - weight)]
+            for by_part, derivative in zip(pull(times * share), chain, strict=True):
+                by_raw.append((by_part * derivative).reshape(*values.shape[:-1], -1))
+            return torch.from_numpy(np.concatenate(by_raw, -1)).to(raw.device)
+
+    return torch.from_numpy(log_q - log_total).to(raw.device), pullback
 
 
-def _gaussians(value: Tensor, parts: _Parts) -> tuple[Tensor, _Pull]:
+def _softmax(logits: _Array) -> tuple[_Array, _Array]:
+    """Return shares ``(*, K)`` and the logarithm of the sum of exponentials ``(*)``."""
+    top = logits.max(-1, keepdims=True)
+    share = np.exp(logits - top)
+    total = share.sum(-1, keepdims=True)
+    share /= total
+    return share, (np.log(total) + top)[..., 0]
+
+
+def _parts(network: MixtureDensityNetwork, raw: _Array) -> tuple[_Parts, _Parts]:
+    """Return what :meth:`.MixtureDensityNetwork.parts` does, and its derivatives by ``raw``."""
+    shape = (*raw.shape[:-1], network.components, network.parameters_)
+    first, second, third = accumulate(network.sizes[:-1])
+    loc = np.tanh(raw[..., first:second].reshape(shape) / network.reach)
+    variance = raw[..., second:third].reshape(shape)
+    steepness = np.exp(np.minimum(variance, 0.0))  # the derivative of melu
+    deviation = np.sqrt(steepness + np.maximum(variance, 0.0) + FLOOR)
+    widening = network.widening.double().cpu().numpy()
+    bent = np.tanh(deviation * (widening / WIDEST))
+    slope = raw[..., third:].reshape(*shape[:-1], network.sizes[-1] // network.components)
+    slope = np.tanh(slope / STEEPEST) if slope.size else slope
+    return _Parts(network.reach * loc, WIDEST * bent, STEEPEST * slope), _Parts(
+        1 - loc * loc,
+        (1 - bent * bent) * steepness * (0.5 * widening) / deviation,
+        1 - slope * slope,
+    )
+
+
+def _gaussians(value: _Array, parts: _Parts) -> tuple[_Array, _Pull]:
     r"""Return each component's log-density ``(*, K)``, and what pulls gradients back.
 
     Row d of the factor is :math:`(c_d, 1) / g_d` with slopes :math:`c_d` and
@@ -89,82 +132,75 @@ def _gaussians(value: Tensor, parts: _Parts) -> tuple[Tensor, _Pull]:
     :math:`\varepsilon_d = g_d (z_d - \mu_d) - c_d^T \varepsilon_{<d}`, and the adjoint of
     :math:`-\varepsilon^T\varepsilon / 2` runs backward through it.
     """
-    size = parts.loc.shape[-1]
-    centred = value.unsqueeze(-2) - parts.loc
-    # views of shape (*, K, d); none for a diagonal factor
-    rows = parts.slope.split(list(range(size)), -1) if parts.slope.shape[-1] else ()
-    square = torch.stack([1 + row.square().sum(-1) for row in rows], -1) if rows else _ONE
-    scale = square.sqrt() / parts.deviation
-    scaled = scale * centred
-    noise = scaled
-    if rows:
-        found = [scaled[..., 0]]
-        for d in range(1, size):
-            found.append(scaled[..., d] - (rows[d] * torch.stack(found, -1)).sum(-1))
-        noise = torch.stack(found, -1)
-    log_n = scale.log().sum(-1) - 0.5 * (noise.square().sum(-1) + size * math.log(2 * math.pi))
+    loc, deviation, slope = parts
+    size = loc.shape[-1]
+    rows = [slope[..., _row(d)] for d in range(size)] if slope.size else []
+    square = np.stack([1 + (row * row).sum(-1) for row in rows], -1) if rows else np.ones(())
+    scale = np.sqrt(square) / deviation
+    scaled = scale * (value[..., None, :] - loc)
+    noise = scaled.copy() if rows else scaled
+    for d, row in enumerate(rows):
+        noise[..., d] -= (row * noise[..., :d]).sum(-1)
+    log_n = (np.log(scale) - 0.5 * noise * noise).sum(-1) - size * _HALF_LOG_2_PI
 
-    def pull(share: Tensor) -> _Parts:
-        share = share.unsqueeze(-1)
+    def pull(share: _Array) -> _Parts:
+        share = share[..., None]
         adjoint = -share * noise
         for d in reversed(range(1, len(rows))):
-            adjoint[..., :d] -= rows[d] * adjoint[..., d : d + 1]
+            adjoint[..., :d] -= rows[d] * adjoint[..., d, None]
         by_log_scale = adjoint * scaled + share
-        by_slope = [
-            by_log_scale[..., d : d + 1] / square[..., d : d + 1] * row
-            - adjoint[..., d : d + 1] * noise[..., :d]
-            for d, row in enumerate(rows)
-        ]
-        return _Parts(
-            -adjoint * scale,
-            -by_log_scale / parts.deviation,
-            torch.cat(by_slope, -1) if rows else parts.slope,
-        )
+        by_slope, by_square = np.empty_like(slope), by_log_scale / square if rows else square
+        for d, row in enumerate(rows):
+            of_noise = adjoint[..., d, None] * noise[..., :d]
+            by_slope[..., _row(d)] = by_square[..., d, None] * row - of_noise
+        return _Parts(-adjoint * scale, -by_log_scale / deviation, by_slope)
 
     return log_n, pull
 
 
-def _restricted(log_n: Tensor, pull_n: _Pull, mass: tuple[Tensor, _Pull]) -> tuple[Tensor, _Pull]:
-    """Return densities and what pulls back, both over the mass in the box."""
+def _row(d: int) -> slice:
+    """Return where the slopes of row d of the factor are."""
+    return slice(d * (d - 1) // 2, d * (d + 1) // 2)
+
+
+def _restricted(log_n: _Array, pull_n: _Pull, mass: tuple[_Array, _Pull]) -> tuple[_Array, _Pull]:
+    """Return densities over masses in the box, and what pulls back."""
     log_z, pull_z = mass
 
-    def pull(share: Tensor) -> _Parts:
+    def pull(share: _Array) -> _Parts:
         return _Parts(*(n - z for n, z in zip(pull_n(share), pull_z(share), strict=True)))
 
     return log_n - log_z, pull
 
 
-def _masses(parts: _Parts, box: tuple[Tensor, Tensor], points: int) -> tuple[Tensor, _Pull]:
+def _masses(parts: _Parts, box: tuple[Tensor, Tensor], points: int) -> tuple[_Array, _Pull]:
     """Return the log of each component's mass in the box ``(*, K)``, and what pulls back."""
-    low, high = (edge.to(parts.loc) for edge in box)
-    if parts.slope.shape[-1]:
-        with torch.enable_grad():
-            leaves = _Parts(*(part.detach().requires_grad_() for part in parts))
-            scale_tril = factor(leaves.deviation, leaves.slope)
-            found = log_mass(leaves.loc, scale_tril, (low, high), diagonal=False, points=points)
-        return found.detach(), lambda share: _Parts(*torch.autograd.grad(found, leaves, share))
-    a, b = (low - parts.loc) / parts.deviation, (high - parts.loc) / parts.deviation
-    each, by_a, by_b = log_interval_and_slopes(a, b)
+    edges = box[0].double().cpu(), box[1].double().cpu()
+    return _correlated(parts, edges, points) if parts.slope.size else _independent(parts, edges)
 
-    def pull(share: Tensor) -> _Parts:
-        outer = -share.unsqueeze(-1) / parts.deviation
-        return _Parts(outer * (by_a + by_b), outer * (a * by_a + b * by_b), parts.slope)
+
+def _independent(parts: _Parts, edges: tuple[Tensor, Tensor]) -> tuple[_Array, _Pull]:
+    r"""Return it for diagonal factors, of which :math:`\partial_b \log Z = \phi(b) / Z`."""
+    a, b = ((edge.numpy() - parts.loc) / parts.deviation for edge in edges)
+    each = log_interval(torch.from_numpy(a), torch.from_numpy(b)).numpy()
+
+    def pull(share: _Array) -> _Parts:
+        outer = share[..., None] / parts.deviation
+        by_a, by_b = (np.exp(-0.5 * x * x - each - _HALF_LOG_2_PI) for x in (a, b))
+        return _Parts(outer * (by_a - by_b), outer * (a * by_a - b * by_b), parts.slope)
 
     return each.sum(-1), pull
 
 
-def _chain(
-    network: MixtureDensityNetwork, raw: Tensor, parts: _Parts, by_parts: _Parts
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the gradient by what :meth:`.MixtureDensityNetwork.parts` made the parts of."""
-    # of tanh, by its value; of the square root of melu, whose derivative is exp(min(z, 0))
-    variance_raw = raw.split(network.sizes, -1)[2].reshape(parts.deviation.shape)
-    ratio = parts.deviation / WIDEST
-    steepness = variance_raw.clamp(max=0.0).exp()
-    variance = steepness + variance_raw.relu() + FLOOR
-    by_variance = 0.5 * network.widening * steepness / variance.sqrt() * (1 - ratio.square())
-    return (
-        by_parts.loc * (1 - (parts.loc / network.reach).square()),
-        by_parts.deviation * by_variance,
-        by_parts.slope * (1 - (parts.slope / STEEPEST).square()),
-    )
+def _correlated(parts: _Parts, edges: tuple[Tensor, Tensor], points: int) -> tuple[_Array, _Pull]:
+    """Return it by quasi-random points, and its gradient by autograd."""
+    loc, deviation, slope = leaves = [torch.from_numpy(part).requires_grad_() for part in parts]
+    with torch.enable_grad():
+        scale_tril = factor(deviation, slope)
+        log_z = log_mass(loc, scale_tril, edges, diagonal=False, points=points)
+
+    def pull(share: _Array) -> _Parts:
+        found = torch.autograd.grad(log_z, leaves, torch.from_numpy(share))
+        return _Parts(*(part.numpy() for part in found))
+
+    return log_z.detach().numpy(), pull

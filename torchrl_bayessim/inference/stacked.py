@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import silu
-from torch.nn.utils import parameters_to_vector
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from .features import NeuralFeatures, ResidualFeatures
 from .network import MixtureDensityNetwork
@@ -35,26 +35,30 @@ class OneNetwork:
 
     def __init__(self, network: MixtureDensityNetwork) -> None:
         self._network = network
-        self.parameters = list(network.parameters())
-        self._raw: Tensor | None = None
+        self._learned = [p for p in network.parameters() if p.requires_grad]
+        self.parameters = [parameter.detach() for parameter in self._learned]
+        self.gradients = [torch.zeros_like(parameter) for parameter in self.parameters]
+        self._raw = torch.zeros(())
         self._kept = copy.deepcopy(network.state_dict())
 
     def raw(self, scaled: Tensor) -> Tensor:
         """Return the last layer's values for standardised inputs ``(1, B, L)``, ``(1, B, P)``."""
-        raw = self._network.raw(scaled[0])
-        self._raw = raw if raw.requires_grad else None
-        return raw.detach().unsqueeze(0)
+        self._raw = self._network.raw(scaled[0])
+        return self._raw.detach().unsqueeze(0)
 
     def backpropagate(self, gradient: Tensor) -> None:
         """Set the parameters' gradients from the one by what :meth:`raw` returned last."""
-        for parameter in self.parameters:
-            parameter.grad = None
-        if self._raw is not None:  # or all is frozen
-            self._raw.backward(gradient[0].to(self._raw))
+        if self._learned:
+            upstream = gradient[0].to(self._raw)
+            found = torch.autograd.grad(
+                self._raw, self._learned, upstream, allow_unused=True, materialize_grads=True
+            )
+            self.gradients = list(found)
 
     def clip_gradients(self, largest: float) -> None:
         """Scale the gradient down to a norm of at most ``largest``."""
-        nn.utils.clip_grad_norm_(self.parameters, largest)
+        norm = nn.utils.get_total_norm(self.gradients)
+        torch._foreach_mul_(self.gradients, (largest / norm).clamp(max=1.0))
 
     def keep(self, which: Tensor) -> None:
         """Remember the present state, if ``which``, of shape ``(1,)``, says so."""
@@ -73,7 +77,8 @@ class StackedNetworks:
         networks: Stay as they are until :meth:`restore`.
 
     Attributes:
-        parameters: One tensor, of all parameters that are not frozen, and their gradient.
+        parameters: One tensor ``(M, P)``, of all parameters that are not frozen.
+        gradients: By it, the same shape.
 
     Example:
         >>> one, other = (
@@ -91,25 +96,20 @@ class StackedNetworks:
         self._networks = networks
         self._residual = isinstance(networks[0].features, ResidualFeatures)
         # one tensor for whoever makes steps, and views of it for the layers
-        learned = [torch.stack(each) for each in zip(*map(_learned, networks), strict=True)]
-        self._sizes = [each.numel() for each in learned]
-        whole = nn.Parameter(parameters_to_vector(learned).detach())
-        whole.grad = torch.zeros_like(whole)
-        self.parameters, self._gradient = [whole], whole.grad
-        self._kept = whole.detach().clone()
-        views = iter(zip(self._parts(whole.detach()), self._parts(self._gradient), strict=True))
+        flat = [parameters_to_vector(_learned(network)) for network in networks]
+        self._whole = torch.stack(flat).detach()
+        self._gradient = torch.zeros_like(self._whole)
+        self.parameters, self.gradients = [self._whole], [self._gradient]
+        self._kept = self._whole.clone()
+        sizes = [parameter.numel() for parameter in _learned(networks[0])]
+        views = zip(self._whole.split(sizes, 1), self._gradient.split(sizes, 1), strict=True)
         *self._hidden, self._head = (
             _StackedLinear(
-                *(_Stacked([getattr(layer, name) for layer in layers], views) for name in _OF_LAYER)
+                *(_Stacked([getattr(l, name) for l in layers], views) for name in _OF_LAYER)
             )
             for layers in zip(*map(_layers, networks), strict=True)
         )
 
-    def _parts(self, values: Tensor) -> list[Tensor]:
-        """Return views of all parameters, or of as many values, by layer, ``(M, P_i)`` each."""
-        return [part.view(len(self._networks), -1) for part in values.split(self._sizes)]
-
-    @torch.no_grad()
     def raw(self, scaled: Tensor) -> Tensor:
         """Return the last layers' values for standardised inputs ``(M, B, L)``, ``(M, B, P)``."""
         hidden = scaled
@@ -119,7 +119,6 @@ class StackedNetworks:
                 hidden = before + hidden
         return self._head(hidden)
 
-    @torch.no_grad()
     def backpropagate(self, gradient: Tensor) -> None:
         """Set the parameters' gradient from the one by what :meth:`raw` returned last."""
         hidden = self._head.backward(gradient.to(self._gradient))
@@ -131,28 +130,20 @@ class StackedNetworks:
 
     def clip_gradients(self, largest: float) -> None:
         """Scale the gradient of each network down to a norm of at most ``largest``."""
-        if self._gradient.norm() <= largest:  # of all, so none is larger
-            return
-        parts = self._parts(self._gradient)
-        norm = torch.stack([part.square().sum(1) for part in parts]).sum(0).sqrt()
-        share = (largest / norm).clamp(max=1.0).unsqueeze(1)
-        for part in parts:
-            part.mul_(share)
+        norm = torch.linalg.vector_norm(self._gradient, dim=1, keepdim=True)
+        self._gradient.mul_((largest / norm).clamp(max=1.0))
 
     @torch.no_grad()
     def keep(self, which: Tensor) -> None:
         """Remember the present parameters of some networks, ``(M,)`` booleans."""
         here = which.to(self._kept.device)
-        parts = self._parts(self.parameters[0]), self._parts(self._kept)
-        for now, kept in zip(*parts, strict=True):
-            kept[here] = now[here]
+        self._kept[here] = self._whole[here]
 
     @torch.no_grad()
     def restore(self) -> None:
         """Give each network the parameters that were kept last."""
-        for row, network in enumerate(self._networks):
-            for layer, part in zip(_learned(network), self._parts(self._kept), strict=True):
-                layer.copy_(part[row].view_as(layer))
+        for kept, network in zip(self._kept, self._networks, strict=True):
+            vector_to_parameters(kept, _learned(network))
 
 
 class _Stacked:
@@ -174,21 +165,22 @@ class _StackedLinear:
     """M linear layers; ``values`` are what they returned last."""
 
     def __init__(self, weight: _Stacked, bias: _Stacked) -> None:
-        self.weight, self.bias = weight, bias
-        self.inputs = self.values = weight.value
+        self._weight, self._by_weight, self._by_bias = weight.value, weight.gradient, bias.gradient
+        self._turned, self._bias = weight.value.mT, bias.value.unsqueeze(1)
+        self._inputs = self.values = weight.value
 
     def __call__(self, inputs: Tensor) -> Tensor:
-        self.inputs = inputs
-        self.values = torch.baddbmm(self.bias.value.unsqueeze(1), inputs, self.weight.value.mT)
+        self._inputs = inputs
+        self.values = torch.baddbmm(self._bias, inputs, self._turned)
         return self.values
 
     def backward(self, gradient: Tensor, *, last: bool = False) -> Tensor:
         """Set the gradients from the one by the values, and return that by the inputs."""
-        if self.weight.gradient is not None:
-            torch.bmm(gradient.mT, self.inputs, out=self.weight.gradient)
-        if self.bias.gradient is not None:
-            torch.sum(gradient, 1, out=self.bias.gradient)
-        return gradient if last else gradient @ self.weight.value
+        if self._by_weight is not None:
+            torch.bmm(gradient.mT, self._inputs, out=self._by_weight)
+        if self._by_bias is not None:
+            torch.sum(gradient, 1, out=self._by_bias)
+        return gradient if last else torch.bmm(gradient, self._weight)
 
 
 _OF_LAYER = "weight", "bias"

@@ -6,7 +6,7 @@ meant for float64.
 
 from __future__ import annotations
 
-__all__ = ["log_interval", "log_interval_and_slopes", "truncated_quantile"]
+__all__ = ["log_interval", "truncated_quantile"]
 
 import math
 
@@ -29,40 +29,29 @@ def _log_ratio(low: Tensor, high: Tensor, log_high: Tensor) -> Tensor:
     return torch.where(high < -1e3, tail, near).clamp(max=-1e-12)
 
 
-def _log_mass(flip: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """Return the log-mass of mirrored intervals, and what :func:`_slopes` needs."""
-    log_high = torch.special.log_ndtr(high)
-    log_ratio = _log_ratio(low, high, log_high)
-    rest = -torch.expm1(log_ratio)
-    return log_high + torch.log(rest), (flip, low, high, log_ratio, rest)
-
-
-def _slopes(kept: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    r"""Return the derivatives of the log-mass by both limits.
+class _LogInterval(torch.autograd.Function):
+    r"""Forward and backward in closed form: autograd through ``log_ndtr`` gives NaN in the tails.
 
     :math:`\partial_h \log(\Phi(h) - \Phi(l)) = \lambda(h) / (1 - r)` and
     :math:`\partial_l = -r \lambda(l) / (1 - r)` with :math:`r = \Phi(l) / \Phi(h)` and
     :math:`\lambda(x) = \phi(x) / \Phi(x) = \sqrt{2 / \pi} / \operatorname{erfcx}(-x / \sqrt 2)`.
     """
-    flip, low, high, log_ratio, rest = kept
-    d_high = _hazard(high) / rest
-    d_low = -log_ratio.exp() * _hazard(low) / rest
-    return torch.where(flip, -d_high, d_low), torch.where(flip, -d_low, d_high)
-
-
-class _LogInterval(torch.autograd.Function):
-    """Forward and backward in closed form: autograd through ``log_ndtr`` gives NaN in the tails."""
 
     @staticmethod
     def forward(ctx: FunctionCtx, a: Tensor, b: Tensor) -> Tensor:
-        value, kept = _log_mass(*_mirror(a, b))
-        ctx.save_for_backward(*kept)
-        return value
+        flip, low, high = _mirror(a, b)
+        log_high = torch.special.log_ndtr(high)
+        log_ratio = _log_ratio(low, high, log_high)
+        ctx.save_for_backward(flip, low, high, log_ratio)
+        return log_high + torch.log(-torch.expm1(log_ratio))
 
     @staticmethod
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor]:
-        d_a, d_b = _slopes(ctx.saved_tensors)
-        return grad * d_a, grad * d_b
+        flip, low, high, log_ratio = ctx.saved_tensors
+        rest = -torch.expm1(log_ratio)
+        d_high = _hazard(high) / rest
+        d_low = -log_ratio.exp() * _hazard(low) / rest
+        return grad * torch.where(flip, -d_high, d_low), grad * torch.where(flip, -d_low, d_high)
 
 
 class _TruncatedQuantile(torch.autograd.Function):
@@ -104,19 +93,6 @@ def _hazard(x: Tensor) -> Tensor:
 def log_interval(a: Tensor, b: Tensor) -> Tensor:
     r"""Return :math:`\log(\Phi(b) - \Phi(a))` for :math:`a < b`, stable in both tails."""
     return _LogInterval.apply(*torch.broadcast_tensors(a, b))
-
-
-def log_interval_and_slopes(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return :func:`log_interval` and its derivatives by both limits; autograd records nothing.
-
-    Example:
-        >>> one = torch.ones(1, dtype=torch.float64)
-        >>> log_interval_and_slopes(-one, one)[1:]  # phi(1) / 0.6827
-        (tensor([-0.3544], dtype=torch.float64), tensor([0.3544], dtype=torch.float64))
-    """
-    with torch.no_grad():
-        value, kept = _log_mass(*_mirror(*torch.broadcast_tensors(a, b)))
-        return value, *_slopes(kept)
 
 
 def truncated_quantile(a: Tensor, b: Tensor, u: Tensor) -> Tensor:
