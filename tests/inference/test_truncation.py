@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import scipy.stats
 import torch
@@ -9,7 +10,11 @@ from scipy.integrate import quad
 from torch.distributions import MultivariateNormal
 
 from torchrl_bayessim.inference import truncation
-from torchrl_bayessim.inference.truncated_normal import log_interval, truncated_quantile
+from torchrl_bayessim.inference.truncated_normal import (
+    log_interval,
+    log_interval_of_arrays,
+    truncated_quantile,
+)
 from torchrl_bayessim.inference.truncation import (
     TruncatedGaussianMixture,
     log_mass,
@@ -40,8 +45,9 @@ def log_interval_by_quadrature(a, b):
 
 @pytest.mark.parametrize(("a", "b"), INTERVALS)
 def test_the_mass_of_an_interval_is_right_in_both_tails(a, b):
-    got = log_interval(tensor(a), tensor(b)).item()
-    assert got == pytest.approx(log_interval_by_quadrature(a, b), rel=1e-8)
+    expected = pytest.approx(log_interval_by_quadrature(a, b), rel=1e-8)
+    assert log_interval(tensor(a), tensor(b)).item() == expected
+    assert log_interval_of_arrays(np.array([a]), np.array([b])).item() == expected
 
 
 @pytest.mark.parametrize(("a", "b"), INTERVALS)
@@ -65,6 +71,8 @@ def test_nothing_overflows_at_absurd_distances(at, sign):
     low = tensor(sign * at).requires_grad_()
     high = low + 1.0
     mass = log_interval(low, high)
+    ends = low.detach().numpy(), high.detach().numpy()
+    assert log_interval_of_arrays(*ends) == pytest.approx(mass.detach().numpy(), rel=1e-12)
     middle = truncated_quantile(low, high, tensor(0.5))
     (mass + middle).sum().backward()
     assert mass.isfinite().all()

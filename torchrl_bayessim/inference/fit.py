@@ -61,7 +61,7 @@ def fit(
     posterior: MixtureDensityPosterior,
     data: TensorDictBase,
     *,
-    epochs: int = 45,
+    epochs: int = 42,
     batch_size: int = 64,
     lr: float = 1e-2,
     weight_decay: float = 1e-4,

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .network import FLOOR, STEEPEST, WIDEST, MixtureDensityNetwork, factor
-from .truncated_normal import log_interval
+from .truncated_normal import log_interval_of_arrays
 from .truncation import POINTS, log_mass
 
 _Array = NDArray[np.float64]
@@ -182,7 +182,7 @@ def _masses(parts: _Parts, box: tuple[Tensor, Tensor], points: int) -> tuple[_Ar
 def _independent(parts: _Parts, edges: tuple[Tensor, Tensor]) -> tuple[_Array, _Pull]:
     r"""Return it for diagonal factors, of which :math:`\partial_b \log Z = \phi(b) / Z`."""
     a, b = ((edge.numpy() - parts.loc) / parts.deviation for edge in edges)
-    each = log_interval(torch.from_numpy(a), torch.from_numpy(b)).numpy()
+    each = log_interval_of_arrays(a, b)
 
     def pull(share: _Array) -> _Parts:
         outer = share[..., None] / parts.deviation

@@ -6,11 +6,14 @@ meant for float64.
 
 from __future__ import annotations
 
-__all__ = ["log_interval", "truncated_quantile"]
+__all__ = ["log_interval", "log_interval_of_arrays", "truncated_quantile"]
 
 import math
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.special import log_ndtr
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
@@ -93,6 +96,23 @@ def _hazard(x: Tensor) -> Tensor:
 def log_interval(a: Tensor, b: Tensor) -> Tensor:
     r"""Return :math:`\log(\Phi(b) - \Phi(a))` for :math:`a < b`, stable in both tails."""
     return _LogInterval.apply(*torch.broadcast_tensors(a, b))
+
+
+def log_interval_of_arrays(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return :func:`log_interval` of arrays, without gradients: of small ones in half the time.
+
+    Example:
+        >>> log_interval_of_arrays(-np.ones(1), np.ones(1)).round(4)  # log 0.6827
+        array([-0.3817])
+    """
+    flip = a > 0
+    low, high = np.where(flip, -b, a), np.where(flip, -a, b)
+    log_high = log_ndtr(high)
+    log_ratio = log_ndtr(low) - log_high
+    far = high < -1e3  # as in _log_ratio
+    if far.any():
+        log_ratio[far] = 0.5 * ((high - low) * (high + low))[far]
+    return log_high + np.log(-np.expm1(np.minimum(log_ratio, -1e-12)))
 
 
 def truncated_quantile(a: Tensor, b: Tensor, u: Tensor) -> Tensor:
