@@ -28,13 +28,12 @@ def network(parameters, covariance, reach=EDGE, components=3):
 @pytest.mark.parametrize("spread", [0.1, 1.0, 5.0])
 def test_density_and_gradient_are_those_of_autograd(size, covariance, boxed, spread):
     net = network(size, covariance)
-    net.widening.copy_(torch.linspace(0.8, 1.3, size))
     draw = generator("gradients", size, covariance, boxed)
     raw = spread * torch.randn(2, 7, sum(net.sizes), dtype=torch.float64, generator=draw)
     value = EDGE * (2 * torch.rand(2, 7, size, dtype=torch.float64, generator=draw) - 1)
     box = (torch.full((size,), -EDGE), torch.full((size,), EDGE)) if boxed else None
     raw.requires_grad_()
-    mixture = net.widened(raw, net.widening)
+    mixture = net.widened(raw, net.widening, net.contrast)
     diagonal = covariance == "diagonal"
     expected = TruncatedGaussianMixture(*mixture, box, diagonal=diagonal, points=8).formula(value)
     upstream = torch.randn(expected.shape, dtype=torch.float64, generator=draw)

@@ -75,6 +75,7 @@ def descend(
     first, size = posteriors[0], len(posteriors)
     for posterior in posteriors:
         posterior.network.widening.fill_(1.0)
+        posterior.network.contrast.fill_(1.0)
     networks = as_one([posterior.network for posterior in posteriors])
     pairs, held = _reader(first, train), _prepared(first, validation)
     held = _Pairs(*(value.expand(size, *value.shape) for value in held))

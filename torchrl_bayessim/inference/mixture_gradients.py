@@ -53,7 +53,8 @@ def log_density_and_pullback(
 ) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
     """Return log-densities of standardised parameters, and what returns their gradient.
 
-    Worked out on the processor, wherever the values are.
+    Those before the mixture is widened, as a fit does in its end. Worked out on the processor,
+    wherever the values are.
 
     Args:
         network: Says what its last layer's values mean.
@@ -106,20 +107,19 @@ def _softmax(logits: _Array) -> tuple[_Array, _Array]:
 
 
 def _parts(network: MixtureDensityNetwork, raw: _Array) -> tuple[_Parts, _Parts]:
-    """Return what :meth:`.MixtureDensityNetwork.parts` does, and its derivatives by ``raw``."""
+    """Return what the network makes of ``raw`` before it is widened, and the derivatives."""
     shape = (*raw.shape[:-1], network.components, network.parameters_)
     first, second, third = accumulate(network.sizes[:-1])
     loc = np.tanh(raw[..., first:second].reshape(shape) / network.reach)
     variance = raw[..., second:third].reshape(shape)
     steepness = np.exp(np.minimum(variance, 0.0))  # the derivative of melu
     deviation = np.sqrt(steepness + np.maximum(variance, 0.0) + FLOOR)
-    widening = network.widening.double().cpu().numpy()
-    bent = np.tanh(deviation * (widening / WIDEST))
+    bent = np.tanh(deviation / WIDEST)
     slope = raw[..., third:].reshape(*shape[:-1], network.sizes[-1] // network.components)
     slope = np.tanh(slope / STEEPEST) if slope.size else slope
     return _Parts(network.reach * loc, WIDEST * bent, STEEPEST * slope), _Parts(
         1 - loc * loc,
-        (1 - bent * bent) * steepness * (0.5 * widening) / deviation,
+        (1 - bent * bent) * steepness * 0.5 / deviation,
         1 - slope * slope,
     )
 

@@ -55,6 +55,7 @@ class MixtureDensityNetwork(nn.Module):
     shift: Tensor
     scale: Tensor
     widening: Tensor  # of each parameter's deviations, where a fit was found too sure, shape (D,)
+    contrast: Tensor  # of their logarithms, where it was so of some summaries more, shape (D,)
 
     def __init__(
         self,
@@ -88,11 +89,13 @@ class MixtureDensityNetwork(nn.Module):
         self.register_buffer("shift", torch.zeros(features.dim))
         self.register_buffer("scale", torch.ones(features.dim))
         self.register_buffer("widening", torch.ones(parameters))
+        self.register_buffer("contrast", torch.ones(parameters))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         widening = state_dict.get(f"{prefix}widening")
         if widening is not None and not widening.ndim:  # of before: one factor for all parameters
             state_dict[f"{prefix}widening"] = widening.expand_as(self.widening)
+        state_dict.setdefault(f"{prefix}contrast", torch.ones_like(self.contrast))
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def standardize_inputs(self, summaries: Tensor | Iterable[Tensor]) -> InputScaling:
@@ -126,27 +129,34 @@ class MixtureDensityNetwork(nn.Module):
 
     def mixture(self, scaled: Tensor) -> Mixture:
         """Return the mixture for what :meth:`scaled` made of summaries, ``(*, L)``."""
-        return self.widened(self.raw(scaled), self.widening)
+        return self.widened(self.raw(scaled), self.widening, self.contrast)
 
     def raw(self, scaled: Tensor) -> Tensor:
         """Return the last layer's values, from which :meth:`widened` makes the mixture."""
         return self.head(self.features(scaled))
 
-    def widened(self, raw: Tensor, widening: Tensor) -> Mixture:
-        """Return the mixture of :meth:`raw` values with these factors on deviations, ``(D,)``."""
-        logits, loc, deviation, slope = self.parts(raw, widening)
+    def widened(self, raw: Tensor, widening: Tensor, contrast: Tensor) -> Mixture:
+        """Return the mixture of :meth:`raw` values, wider or narrower.
+
+        Args:
+            raw: Values of the last layer, shape ``(*, P)``.
+            widening: Factor on each parameter's deviations, shape ``(D,)``.
+            contrast: Power to which they are raised before, in prior deviations, shape ``(D,)``.
+        """
+        logits, loc, deviation, slope = self.parts(raw)
+        deviation = WIDEST * torch.tanh(widening * deviation**contrast / WIDEST)
         return Mixture(logits, loc, factor(deviation, slope))
 
-    def parts(self, raw: Tensor, widening: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def parts(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return logits ``(*, K)``, means and deviations ``(*, K, D)``, slopes of :func:`factor`.
 
-        The slopes are of shape ``(*, K, D (D - 1) / 2)``, or ``(*, K, 0)`` without correlations.
+        The slopes are of shape ``(*, K, D (D - 1) / 2)``, or ``(*, K, 0)`` without correlations;
+        the deviations those before :meth:`widened` bounds them.
         """
         logits, loc, diagonal, slope = raw.split(self.sizes, -1)
         each = (*raw.shape[:-1], self.components)
         loc = self.reach * torch.tanh(loc.reshape(*each, self.parameters_) / self.reach)
-        deviation = widening * melu(diagonal.reshape(*each, self.parameters_)).sqrt()
-        deviation = WIDEST * torch.tanh(deviation / WIDEST)
+        deviation = melu(diagonal.reshape(*each, self.parameters_)).sqrt()
         slope = slope.reshape(*each, self.sizes[-1] // self.components)
         return logits, loc, deviation, STEEPEST * torch.tanh(slope / STEEPEST)
 

@@ -3,17 +3,21 @@ r"""How wide a fitted posterior, or an average of several, is to be: as held-out
 A network is surer of the pairs that it learned from than of others, and of a parameter that they
 say nothing about most of all. A factor on the deviations of each parameter, learned from the
 others, undoes most of it (after temperature scaling, Guo et al., 2017, arXiv:1706.04599). An
-average of networks that disagree is wider than each of them already: it may need less than 1.
+average of networks that disagree is wider than each of them already: it may need less than 1. Where
+it is sharp it is too wide, and too sure where it is not: a power of the deviations, too, is learned
+for an average, :math:`\sigma \to f_d\, m_d (\sigma / m_d)^{c_d}` with :math:`m_d` their geometric
+mean.
 
-The factors :math:`f_d` maximise
+Factors and powers maximise
 
 .. math::
-    \sum_i \log q_f(\theta_i \mid x_i) - \sum_d \log(1 + (\log (f_d / f_0) / s)^2)
+    \sum_i \log q_{f, c}(\theta_i \mid x_i) - \sum_d \log(1 + (\log (f_d / f_0) / s)^2)
+    - \sum_d \log(1 + (\log c_d / s)^2)
 
 over the held-out pairs (by their weights, which sum to the effective number of pairs): they stay
-near :math:`f_0`, which is 1 for averages and 1.1 for a network alone, unless the pairs say
-otherwise, and follow them freely where they do, as those of a parameter that nothing is known about
-must.
+near :math:`f_0`, which is 1 for averages and 1.1 for a network alone, and near 1, unless the pairs
+say otherwise, and follow them freely where they do, as those of a parameter that nothing is known
+about must.
 """
 
 from __future__ import annotations
@@ -35,18 +39,22 @@ from .truncation import TruncatedGaussianMixture
 from .weights import effective_sample_size, weights_of
 
 _NARROWEST, _WIDEST = 0.5, 10.0
+_STEEPEST = 2.0  # power of deviations
 _NEAR = 0.15  # s: what a hundred pairs leave unsure
 _TOO_SURE = 1.1  # what a network alone needs, where the pairs are too few to say
 _MOST = 2000  # held-out pairs that are used
 
 
 def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase) -> Tensor:
-    """Set the factors on deviations that make held-out pairs likeliest; return them, ``(D,)``.
+    """Set what is done to deviations so that held-out pairs are likeliest; return the factors.
 
     Args:
-        networks: Changed in place; several get the same factors, which suit their average. One
-            alone is never made surer.
+        networks: Changed in place; several get the same, which suits their average. One alone is
+            never made surer.
         held_out: Pairs ``{"theta", "summary"[, "weight"]}`` that no network learned from.
+
+    Returns:
+        Factors on the geometric means of the parameters' deviations, shape ``(D,)``.
     """
     first, alone = networks[0], len(networks) == 1
     weight = weights_of(held_out)
@@ -59,30 +67,49 @@ def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase)
     with torch.no_grad():
         summary = held_out.get(first.summary_key)
         raw = [n.network.raw(n.network.scaled(summary)) for n in networks]
+        means = [_log_mean(n, r, weight) for n, r in zip(networks, raw, strict=True)]
+        middle = torch.stack(means).mean(0)
 
-    def loss(values: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    def scales(values: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what is to be done to deviations: a factor, and before a power."""
+        log_factors, log_powers = values
+        powers = log_powers.exp()
+        return (log_factors + (1 - powers) * middle).exp(), powers
+
+    def loss(given: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         with torch.enable_grad():
-            log_factors = torch.as_tensor(values).to(z).requires_grad_()
-            factors = log_factors.exp()
+            values = torch.as_tensor(given).to(z).view(2, -1).requires_grad_()
             mixtures = [
-                n.network.widened(r, factors.to(r)) for n, r in zip(networks, raw, strict=True)
+                n.network.widened(r, *(scale.to(r) for scale in scales(values)))
+                for n, r in zip(networks, raw, strict=True)
             ]
             members = [in_training(n, m) for n, m in zip(networks, mixtures, strict=True)]
-            penalty = ((log_factors - usual) / _NEAR).square().log1p().sum() / pairs
-            total = penalty - (average(members).formula(z) * weight).sum()
-            (gradient,) = torch.autograd.grad(total, log_factors)
-        return total.item(), gradient.double().cpu().numpy()
+            away = (values - values.new_tensor([[usual], [0.0]])) / _NEAR
+            total = away.square().log1p().sum() / pairs
+            total = total - (average(members).formula(z) * weight).sum()
+            (gradient,) = torch.autograd.grad(total, values)
+        return total.item(), gradient.double().cpu().numpy().ravel()
 
     size = len(first.prior.names)
     bounds = [(math.log(1.0 if alone else _NARROWEST), math.log(_WIDEST))] * size
+    bounds += [(0.0, 0.0) if alone else (-math.log(_STEEPEST), math.log(_STEEPEST))] * size
     options = {"maxiter": 15, "ftol": 1e-6}
     found = minimize(
-        loss, np.zeros(size), jac=True, method="L-BFGS-B", bounds=bounds, options=options
+        loss, np.zeros(2 * size), jac=True, method="L-BFGS-B", bounds=bounds, options=options
     )
-    factors = torch.as_tensor(found.x).exp()
+    values = torch.as_tensor(found.x).to(z).view(2, -1)
+    widening, contrast = scales(values)
     for network in networks:
-        network.network.widening.copy_(factors)
-    return factors
+        network.network.widening.copy_(widening)
+        network.network.contrast.copy_(contrast)
+    return values[0].exp()
+
+
+def _log_mean(posterior: MixtureDensityPosterior, raw: Tensor, weight: Tensor) -> Tensor:
+    """Return the mean logarithm of each parameter's deviations, ``(D,)``."""
+    logits, _, deviation, _ = posterior.network.parts(raw)
+    each = logits.softmax(-1).unsqueeze(-1) * deviation.log()
+    return weight @ each.sum(-2).to(weight)
 
 
 def average(members: Sequence[TruncatedGaussianMixture]) -> TruncatedGaussianMixture:
