@@ -54,3 +54,15 @@ def test_gradients_stay_finite_far_out(covariance):
     log_q, pullback = log_density_and_pullback(net, raw, value, box=box)
     assert log_q.isfinite().all()
     assert pullback(torch.ones(500)).isfinite().all()
+
+
+@pytest.mark.parametrize("covariance", ["full", "diagonal"])
+def test_densities_are_given_where_autograd_is_off_and_for_one_pair(covariance):
+    net = network(2, covariance)
+    box = torch.full((2,), -EDGE), torch.full((2,), EDGE)
+    raw = torch.randn(sum(net.sizes), generator=generator("one"))
+    with torch.no_grad():
+        log_q, _ = log_density_and_pullback(net, raw, torch.zeros(2), box=box)
+    again, pullback = log_density_and_pullback(net, raw, torch.zeros(2), box=box)
+    assert log_q == again
+    assert pullback(torch.ones(())).shape == raw.shape

@@ -47,7 +47,7 @@ def test_networks_fitted_at_once_are_those_fitted_one_by_one(
 
 def gradients_of(stacked, networks):
     """Yield the gradient of all parameters of each network, by hand and by autograd."""
-    for row, network in zip(stacked.gradients[0], networks, strict=True):
+    for row, network in zip(stacked.gradient, networks, strict=True):
         yield row, torch.cat([parameter.grad.flatten() for parameter in network.parameters()])
 
 
@@ -164,6 +164,94 @@ def test_only_networks_that_differ_in_parameters_alone_are_stacked():
     assert not alike([fourier[0].network, fourier[1].network])
     third.shift.fill_(1.0)
     assert not alike([first, third])
+
+
+@pytest.mark.parametrize("features", ["residual", "neural"])
+def test_layers_that_are_one_are_not_trained_as_several(features):
+    options = {"features": NeuralFeatures(2, widths=(8, 8, 8))} if features == "neural" else {}
+    net = posteriors(**options)[0]
+    layers = net.network.features.layers if options else net.network.features.blocks
+    assert alike([net.network])
+    layers[-2 if options else 1] = layers[2 if options else 0]
+    assert not alike([net.network])
+    report = fit(net, pairs(), **OPTIONS)
+    net.network.widening.fill_(1.0)
+    assert net.held_out is not None
+    loss = PosteriorLoss(net)(net.held_out)["loss_posterior"].item()
+    assert loss == pytest.approx(report.best, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    "hook",
+    [
+        lambda network, found: network.head.register_full_backward_pre_hook(
+            lambda *_: found.append(1)
+        ),
+        lambda network, found: network.head.bias.register_hook(lambda _: found.append(1)),
+        lambda network, found: network.head.bias.register_post_accumulate_grad_hook(
+            lambda _: found.append(1)
+        ),
+    ],
+)
+def test_who_waits_for_a_backward_pass_sees_it(hook):
+    net, found = posteriors()[0], []
+    hook(net.network, found)
+    fit(net, pairs(60), **OPTIONS)
+    assert len(found) == OPTIONS["epochs"]
+
+
+def test_parameters_stay_where_they_are():
+    nets = posteriors()
+    before = [[p.data_ptr() for p in net.parameters()] for net in nets]
+    fit_several(nets, pairs(), seeds=[1, 2, 3], **OPTIONS)
+    assert [[p.data_ptr() for p in net.parameters()] for net in nets] == before
+
+
+class Written(Features):
+    """One linear map, written so that its gradient comes in another layout, or from two places."""
+
+    def __init__(self, form):
+        super().__init__()
+        self.dim, self.out_features, self.form = 2, 6, form
+        draw = torch.randn(6, 2, generator=generator("written"))
+        parts = [draw, torch.zeros(6, 2)]
+        self.w, self.v = (torch.nn.Parameter(part.clone()) for part in parts)
+
+    def forward(self, x):
+        if self.form == "einsum":
+            return torch.einsum("bl,hl->bh", x, self.w)
+        if self.form == "contiguous":
+            return x @ self.w.T.contiguous()
+        if self.form == "moved":
+            self.w.data = self.w.data.clamp(-50.0, 50.0)
+        return x @ self.w.T
+
+
+@pytest.mark.parametrize("form", ["einsum", "contiguous", "moved"])
+def test_the_way_in_which_features_are_written_does_not_matter(form):
+    one, other = (posteriors(features=Written(form))[0] for form in (form, "plain"))
+    for net in (one, other):
+        fit(net, pairs(), weight_decay=0.5, **OPTIONS)
+    features, expected = one.network.features, other.network.features
+    torch.testing.assert_close(features.w, expected.w, rtol=1e-4, atol=1e-5)
+    assert features.w.ne(torch.randn(6, 2, generator=generator("written"))).any()
+    assert not features.v.any()  # unused ones are left alone
+
+
+def test_a_network_that_is_frozen_is_refused():
+    net = posteriors()[0]
+    net.network.requires_grad_(False)
+    with pytest.raises(ValueError, match="parameters that are to be learned, got 'all frozen'"):
+        fit(net, pairs(), **OPTIONS)
+
+
+@pytest.mark.parametrize("features", ["residual", "fourier"])
+def test_a_fit_does_not_ask_what_autograd_is_set_to(features):
+    nets = posteriors(features=features)[:2]
+    usual = fit(nets[0], pairs(), **OPTIONS)
+    nets = posteriors(features=features)[:2]
+    with torch.no_grad(), torch.autocast("cpu"):
+        assert fit(nets[0], pairs(), **OPTIONS).validation == usual.validation
 
 
 @pytest.mark.parametrize(

@@ -26,15 +26,32 @@ def test_steps_are_those_of_adamw(weight_decay):
         ResidualFeatures(3, width=8), 2, components=2, covariance="full", reach=1.7
     )
     stacked = StackedNetworks([network])
-    whole = stacked.parameters[0].clone().requires_grad_()
+    whole = stacked.parameters.clone().requires_grad_()
     usual = torch.optim.AdamW([whole], lr=1.0, betas=(0.9, 0.95), weight_decay=weight_decay)
     step = Steps(stacked, 10, lr=1e-2, weight_decay=weight_decay)
     for i in range(10):
         gradient = torch.randn(whole.shape, generator=torch.Generator().manual_seed(i))
-        stacked.gradients[0].copy_(gradient)
+        stacked.gradient.copy_(gradient)
         whole.grad = gradient.clone()
         torch.nn.utils.clip_grad_norm_([whole], 10.0)
         usual.param_groups[0]["lr"] = 1e-2 * _rate(i, 10)
         usual.step()
         step()
-    torch.testing.assert_close(stacked.parameters[0], whole.detach(), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(stacked.parameters, whole.detach(), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("usual", [torch.float32, torch.float64])
+def test_the_first_step_is_the_rate_long(usual):
+    torch.set_default_dtype(usual)
+    try:
+        network = MixtureDensityNetwork(
+            ResidualFeatures(3, width=8), 2, components=2, covariance="full", reach=1.7
+        )
+        stacked = StackedNetworks([network])
+        before = stacked.parameters.clone()
+        stacked.gradient.fill_(1e-2)
+        Steps(stacked, 10, lr=1e-2, weight_decay=0.0)()
+    finally:
+        torch.set_default_dtype(torch.float32)
+    expected = torch.full_like(before, 1e-2 * _rate(0, 10))
+    torch.testing.assert_close(before - stacked.parameters, expected, rtol=1e-3, atol=0)

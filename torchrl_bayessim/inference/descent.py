@@ -23,7 +23,7 @@ from ..errors import SimulationError, message
 from ..randomness import generator
 from .mixture_gradients import log_density_and_pullback
 from .posterior import TRAINING_POINTS, MixtureDensityPosterior
-from .rows import Rows
+from .rows import PART, Rows
 from .stacked import OneNetwork, StackedNetworks, as_one
 from .steps import Steps
 from .weights import weights_of
@@ -72,50 +72,77 @@ def descend(
     Raises:
         SimulationError: A loss is not finite.
     """
-    first, size = posteriors[0], len(posteriors)
     for posterior in posteriors:
         posterior.network.widening.fill_(1.0)
         posterior.network.contrast.fill_(1.0)
     networks = as_one([posterior.network for posterior in posteriors])
-    pairs, held = _reader(first, train), _prepared(first, validation)
-    held = _Pairs(*(value.expand(size, *value.shape) for value in held))
-    length = math.ceil(len(train) / math.ceil(len(train) / batch_size))
-    batches = math.ceil(len(train) / length)
-    step = Steps(networks, epochs * batches, lr=lr, weight_decay=weight_decay)
-    shuffles = [generator(seed, "minibatches") for seed in seeds]
-    best = torch.full((size,), math.inf)
-    truncated, stale = first.prior.box is None, 0
-    trace: list[tuple[Tensor, Tensor]] = []
-    bar = tqdm(range(epochs), desc="fit", disable=not progress, leave=False, unit="epoch")
+    device = posteriors[0].network.shift.device.type
     try:
-        for epoch in bar:
-            if not truncated and (epoch >= min(_FREE * epochs, epochs - 1) or stale >= patience):
-                truncated, stale = True, 0
-            order = torch.stack([torch.randperm(len(train), generator=g) for g in shuffles])
-            total = (
-                torch.stack(
-                    [
-                        _learn(
-                            first, networks, pairs(rows), step, length=length, truncated=truncated
-                        )
-                        for rows in order.split(_GATHERED * length, 1)
-                    ]
-                ).sum(0)
-                / batches
+        with torch.enable_grad(), torch.autocast(device, enabled=False):
+            trace = _epochs(
+                posteriors[0],
+                networks,
+                _reader(posteriors[0], train),
+                _prepared(posteriors[0], validation),
+                count=len(train),
+                epochs=epochs,
+                batch_size=batch_size,
+                lr=lr,
+                weight_decay=weight_decay,
+                patience=patience,
+                shuffles=[generator(seed, "minibatches") for seed in seeds],
+                progress=progress,
             )
-            held_out = _loss(first, networks, held).cpu()
-            trace.append((_checked(total.cpu()), _checked(held_out)))
-            bar.set_postfix(train=f"{total.mean():.2f}", held_out=f"{held_out.mean():.2f}")
-            better, stale = held_out < best - 1e-4, stale + 1
-            if better.any():
-                best, stale = torch.where(better, held_out, best), 0
-                networks.keep(better)
-            if truncated and stale >= patience:
-                break
     finally:  # interrupted, too, each is what it was at its best
         networks.restore()
     learned, held_out = (torch.stack(part).T.tolist() for part in zip(*trace, strict=True))
     return list(zip(learned, held_out, strict=True))
+
+
+def _epochs(
+    first: MixtureDensityPosterior,
+    networks: OneNetwork | StackedNetworks,
+    pairs: Callable[[Tensor], _Pairs],
+    held: _Pairs,
+    *,
+    count: int,
+    epochs: int,
+    batch_size: int,
+    lr: float,
+    weight_decay: float,
+    patience: int,
+    shuffles: Sequence[torch.Generator],
+    progress: bool,
+) -> list[tuple[Tensor, Tensor]]:
+    """Pass over the pairs again and again; return the losses of each network by epoch."""
+    size = len(shuffles)
+    held = _Pairs(*(value.expand(size, *value.shape) for value in held))
+    length = math.ceil(count / math.ceil(count / batch_size))
+    gathered = max(1, min(_GATHERED, PART // (size * length)))
+    step = Steps(networks, epochs * math.ceil(count / length), lr=lr, weight_decay=weight_decay)
+    best = torch.full((size,), math.inf)
+    truncated, stale = first.prior.box is None, 0
+    trace: list[tuple[Tensor, Tensor]] = []
+    bar = tqdm(range(epochs), desc="fit", disable=not progress, leave=False, unit="epoch")
+    for epoch in bar:
+        if not truncated and (epoch >= min(_FREE * epochs, epochs - 1) or stale >= patience):
+            truncated, stale = True, 0
+        order = torch.stack([torch.randperm(count, generator=g) for g in shuffles])
+        parts = [
+            _learn(first, networks, pairs(rows), step, length=length, truncated=truncated)
+            for rows in order.split(gathered * length, 1)
+        ]
+        total, weight = torch.stack(parts).sum(0)
+        learned, held_out = (total / weight).cpu(), _loss(first, networks, held).cpu()
+        trace.append((_checked(learned), _checked(held_out)))
+        bar.set_postfix(train=f"{learned.mean():.2f}", held_out=f"{held_out.mean():.2f}")
+        better, stale = held_out < best - 1e-4, stale + 1
+        if better.any():
+            best, stale = torch.where(better, held_out, best), 0
+            networks.keep(better)
+        if truncated and stale >= patience:
+            break
+    return trace
 
 
 def _learn(
@@ -127,7 +154,7 @@ def _learn(
     length: int,
     truncated: bool,
 ) -> Tensor:
-    """Make a step for every minibatch; return the sum of their losses, of each network."""
+    """Make a step for every minibatch; return each network's weighted losses, and the weights."""
     network, box = posterior.network, posterior.prior.box if truncated else None
     share = _shares(pairs.weight, length)
     log_q: list[Tensor] = []
@@ -137,7 +164,8 @@ def _learn(
         networks.backpropagate(pullback(own))
         step()
         log_q.append(found)
-    return ((pairs.volume - torch.cat(log_q, 1)) * share).sum(-1)
+    weighted = (pairs.volume - torch.cat(log_q, 1)) * pairs.weight
+    return torch.stack([weighted.sum(-1), pairs.weight.sum(-1)])
 
 
 def _reader(
@@ -171,14 +199,17 @@ def _minibatches(*values: Tensor, length: int) -> Iterator[tuple[Tensor, ...]]:
     return zip(*(value.split(length, 1) for value in values), strict=True)
 
 
+@torch.no_grad()
 def _loss(
     posterior: MixtureDensityPosterior, networks: OneNetwork | StackedNetworks, pairs: _Pairs
 ) -> Tensor:
     """Return each network's weighted negative log-density in nats, as `PosteriorLoss` does."""
-    with torch.no_grad():
-        raw = networks.raw(pairs.scaled)
     log_q, _ = log_density_and_pullback(
-        posterior.network, raw, pairs.z, box=posterior.prior.box, points=TRAINING_POINTS
+        posterior.network,
+        networks.raw(pairs.scaled),
+        pairs.z,
+        box=posterior.prior.box,
+        points=TRAINING_POINTS,
     )
     return ((pairs.volume - log_q) * pairs.weight).sum(-1) / pairs.weight.sum(-1)
 

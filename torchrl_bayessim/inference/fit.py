@@ -76,8 +76,8 @@ def fit(
 
     If the posterior was made with an ``in_key`` or ``out_key``, the pairs' entries are those.
 
-    Pairs on disk, of ``simulate(folder=)`` or ``memmap_``, stay there: a minibatch is read at a
-    time.
+    Pairs on disk, of ``simulate(folder=)`` or ``memmap_``, stay there: some minibatches are
+    read at a time.
 
     AdamW with one cycle of the learning rate: see :mod:`.descent`. After every epoch the loss on
     held-out pairs is computed, and the parameters of the best epoch are kept. Pairs that are not

@@ -65,7 +65,8 @@ def log_density_and_pullback(
 
     Returns:
         Log-densities of shape ``(*)``, float64, and a function to be called once: from weights of
-        that shape to the gradient of the weighted sum by ``raw``, ``(*, P)``.
+        that shape to the gradient of the weighted sum by ``raw``, ``(*, P)``; not where autograd is
+        switched off.
 
     Example:
         >>> from torchrl_bayessim.inference.features import ResidualFeatures
@@ -92,9 +93,9 @@ def log_density_and_pullback(
             by_raw = [times * (share - weight)]
             for by_part, derivative in zip(pull(times * share), chain, strict=True):
                 by_raw.append((by_part * derivative).reshape(*values.shape[:-1], -1))
-            return torch.from_numpy(np.concatenate(by_raw, -1)).to(raw.device)
+            return torch.as_tensor(np.concatenate(by_raw, -1), device=raw.device)
 
-    return torch.from_numpy(log_q - log_total).to(raw.device), pullback
+    return torch.as_tensor(log_q - log_total, device=raw.device), pullback
 
 
 def _softmax(logits: _Array) -> tuple[_Array, _Array]:
@@ -195,9 +196,8 @@ def _independent(parts: _Parts, edges: tuple[Tensor, Tensor]) -> tuple[_Array, _
 def _correlated(parts: _Parts, edges: tuple[Tensor, Tensor], points: int) -> tuple[_Array, _Pull]:
     """Return it by quasi-random points, and its gradient by autograd."""
     loc, deviation, slope = leaves = [torch.from_numpy(part).requires_grad_() for part in parts]
-    with torch.enable_grad():
-        scale_tril = factor(deviation, slope)
-        log_z = log_mass(loc, scale_tril, edges, diagonal=False, points=points)
+    scale_tril = factor(deviation, slope)
+    log_z = log_mass(loc, scale_tril, edges, diagonal=False, points=points)
 
     def pull(share: _Array) -> _Parts:
         found = torch.autograd.grad(log_z, leaves, torch.from_numpy(share))

@@ -11,19 +11,24 @@ __all__ = ["OneNetwork", "StackedNetworks", "alike", "as_one"]
 
 import copy
 from collections.abc import Iterator, Sequence
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import silu
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
+from torch.nn.utils import parameters_to_vector
 
+from ..errors import message
 from .features import NeuralFeatures, ResidualFeatures
 from .network import MixtureDensityNetwork
 
 
 def as_one(networks: Sequence[MixtureDensityNetwork]) -> OneNetwork | StackedNetworks:
-    """Return what is trained in the place of networks that are :func:`alike`, or of one."""
-    return StackedNetworks(networks) if alike(networks) else OneNetwork(networks[0])
+    """Return what is trained in the place of networks: several are :func:`alike`."""
+    if alike(networks):
+        return StackedNetworks(networks)
+    (network,) = networks
+    return OneNetwork(network)
 
 
 class OneNetwork:
@@ -31,13 +36,17 @@ class OneNetwork:
 
     Args:
         network: Trained in place.
+
+    Raises:
+        ValueError: All of it is frozen.
     """
 
     def __init__(self, network: MixtureDensityNetwork) -> None:
+        if not any(parameter.requires_grad for parameter in network.parameters()):
+            expected = "a network with parameters that are to be learned"
+            raise ValueError(message(expected, "all frozen", hint="requires_grad_() on some"))
         self._network = network
-        self._learned = [p for p in network.parameters() if p.requires_grad]
-        self.parameters = [parameter.detach() for parameter in self._learned]
-        self.gradients = [torch.zeros_like(parameter) for parameter in self.parameters]
+        self.parameters = list(network.parameters())
         self._raw = torch.zeros(())
         self._kept = copy.deepcopy(network.state_dict())
 
@@ -48,17 +57,13 @@ class OneNetwork:
 
     def backpropagate(self, gradient: Tensor) -> None:
         """Set the parameters' gradients from the one by what :meth:`raw` returned last."""
-        if self._learned:
-            upstream = gradient[0].to(self._raw)
-            found = torch.autograd.grad(
-                self._raw, self._learned, upstream, allow_unused=True, materialize_grads=True
-            )
-            self.gradients = list(found)
+        for parameter in self.parameters:
+            parameter.grad = None
+        self._raw.backward(gradient[0].to(self._raw))
 
     def clip_gradients(self, largest: float) -> None:
         """Scale the gradient down to a norm of at most ``largest``."""
-        norm = nn.utils.get_total_norm(self.gradients)
-        torch._foreach_mul_(self.gradients, (largest / norm).clamp(max=1.0))
+        nn.utils.clip_grad_norm_(self.parameters, largest)
 
     def keep(self, which: Tensor) -> None:
         """Remember the present state, if ``which``, of shape ``(1,)``, says so."""
@@ -78,7 +83,7 @@ class StackedNetworks:
 
     Attributes:
         parameters: One tensor ``(M, P)``, of all parameters that are not frozen.
-        gradients: By it, the same shape.
+        gradient: By it, of the same shape.
 
     Example:
         >>> one, other = (
@@ -97,12 +102,12 @@ class StackedNetworks:
         self._residual = isinstance(networks[0].features, ResidualFeatures)
         # one tensor for whoever makes steps, and views of it for the layers
         flat = [parameters_to_vector(_learned(network)) for network in networks]
-        self._whole = torch.stack(flat).detach()
-        self._gradient = torch.zeros_like(self._whole)
-        self.parameters, self.gradients = [self._whole], [self._gradient]
-        self._kept = self._whole.clone()
-        sizes = [parameter.numel() for parameter in _learned(networks[0])]
-        views = zip(self._whole.split(sizes, 1), self._gradient.split(sizes, 1), strict=True)
+        self.parameters = torch.stack(flat).detach()
+        self.gradient = torch.zeros_like(self.parameters)
+        self._kept = self.parameters.clone()
+        self._sizes = [parameter.numel() for parameter in _learned(networks[0])]
+        parts = (values.split(self._sizes, 1) for values in (self.parameters, self.gradient))
+        views = zip(*parts, strict=True)
         *self._hidden, self._head = (
             _StackedLinear(
                 *(_Stacked([getattr(l, name) for l in layers], views) for name in _OF_LAYER)
@@ -121,7 +126,7 @@ class StackedNetworks:
 
     def backpropagate(self, gradient: Tensor) -> None:
         """Set the parameters' gradient from the one by what :meth:`raw` returned last."""
-        hidden = self._head.backward(gradient.to(self._gradient))
+        hidden = self._head.backward(gradient.to(self.gradient))
         for i in reversed(range(len(self._hidden))):
             layer = self._hidden[i]
             after, hidden = hidden, layer.backward(_silu_backward(hidden, layer.values), last=not i)
@@ -130,20 +135,22 @@ class StackedNetworks:
 
     def clip_gradients(self, largest: float) -> None:
         """Scale the gradient of each network down to a norm of at most ``largest``."""
-        norm = torch.linalg.vector_norm(self._gradient, dim=1, keepdim=True)
-        self._gradient.mul_((largest / norm).clamp(max=1.0))
+        norm = torch.linalg.vector_norm(self.gradient, dim=1, keepdim=True)
+        self.gradient.mul_((largest / norm).clamp(max=1.0))
 
     @torch.no_grad()
     def keep(self, which: Tensor) -> None:
         """Remember the present parameters of some networks, ``(M,)`` booleans."""
         here = which.to(self._kept.device)
-        self._kept[here] = self._whole[here]
+        self._kept[here] = self.parameters[here]
 
     @torch.no_grad()
     def restore(self) -> None:
         """Give each network the parameters that were kept last."""
         for kept, network in zip(self._kept, self._networks, strict=True):
-            vector_to_parameters(kept, _learned(network))
+            parts = kept.split(self._sizes)
+            for parameter, part in zip(_learned(network), parts, strict=True):
+                parameter.copy_(part.view_as(parameter))
 
 
 class _Stacked:
@@ -194,9 +201,9 @@ def _layers(network: MixtureDensityNetwork) -> list[nn.Linear]:
     """
     features = network.features
     if type(features) is ResidualFeatures:
-        hidden = [features.first, *features.blocks.children()]
+        hidden = [features.first, *cast("nn.ModuleList", features.blocks)]
     elif type(features) is NeuralFeatures:
-        chain = list(features.layers.children())
+        chain = list(cast("nn.Sequential", features.layers))
         hidden, between = chain[::2], chain[1::2]
         if len(between) < len(hidden) or any(type(layer) is not nn.SiLU for layer in between):
             return []
@@ -221,18 +228,32 @@ def alike(networks: Sequence[MixtureDensityNetwork]) -> bool:
         return False
     if any(_hooked(network) for network in networks):
         return False
-    parameters = {id(p) for network in networks for p in network.parameters()}
-    if len(parameters) < sum(2 * len(_layers(network)) for network in networks):
+    weights = [layer.weight for network in networks for layer in _layers(network)]
+    biases = [layer.bias for network in networks for layer in _layers(network)]
+    if len({id(p) for p in weights + biases}) < 2 * len(weights):
         return False  # some are shared
     first = _settings(networks[0])
     return all(_settings(network) == first for network in networks)
 
 
 def _hooked(network: MixtureDensityNetwork) -> bool:
-    return any(
-        module._forward_hooks or module._forward_pre_hooks or module._backward_hooks
+    """Return whether something wants to know of a pass, which no pass by hand would tell."""
+    on_modules = (
+        hooks
         for module in network.modules()
+        for hooks in (
+            module._forward_hooks,
+            module._forward_pre_hooks,
+            module._backward_hooks,
+            module._backward_pre_hooks,
+        )
     )
+    on_parameters = (
+        hooks
+        for parameter in network.parameters()
+        for hooks in (parameter._backward_hooks, parameter._post_accumulate_grad_hooks)
+    )
+    return any(on_modules) or any(on_parameters)
 
 
 def _settings(network: MixtureDensityNetwork) -> tuple[object, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 __all__ = ["Steps"]
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch.optim.adamw import adamw
@@ -14,13 +15,11 @@ from .stacked import OneNetwork, StackedNetworks
 _WARM_UP = 0.1  # share of the steps in which the learning rate rises
 _CLIP = 10.0  # of the gradient's norm
 _BETAS = 0.9, 0.95  # squares of gradients are forgotten within a fit of some hundred steps
-_EPS = 1e-8
+_EPS = 1e-8  # torch's own
 
 
 class Steps:
     """What makes one step after another down the gradients of networks.
-
-    As a function: the class takes longer to look after its state than a small network to learn.
 
     Args:
         networks: Changed in place.
@@ -38,33 +37,62 @@ class Steps:
         lr: float,
         weight_decay: float,
     ) -> None:
-        self._networks, self._count, self._lr = networks, count, lr
-        self._weight_decay, self._made = weight_decay, 0
-        parameters = networks.parameters
-        self._means = [torch.zeros_like(parameter) for parameter in parameters]
-        self._squares = [torch.zeros_like(parameter) for parameter in parameters]
-        self._counts = [torch.zeros((), device=parameter.device) for parameter in parameters]
+        self._networks, self._count, self._lr, self._made = networks, count, lr, 0
+        self._step = (
+            _of_stacked(networks, weight_decay)
+            if isinstance(networks, StackedNetworks)
+            else _of_any(networks, weight_decay)
+        )
 
     def __call__(self) -> None:
         """Make the next step."""
         self._networks.clip_gradients(_CLIP)
+        self._step(self._lr * _rate(self._made, self._count))
+        self._made += 1
+
+
+def _of_any(network: OneNetwork, weight_decay: float) -> Callable[[float], None]:
+    """Return what makes a step at a rate, whatever becomes of the parameters in between."""
+    optimizer = torch.optim.AdamW(
+        network.parameters, betas=_BETAS, weight_decay=weight_decay, fused=True
+    )
+
+    def step(lr: float) -> None:
+        optimizer.param_groups[0]["lr"] = lr
+        optimizer.step()
+
+    return step
+
+
+def _of_stacked(networks: StackedNetworks, weight_decay: float) -> Callable[[float], None]:
+    """Return the same for one tensor that stays where it is.
+
+    As a function: the class takes longer to look after its state than small networks to learn.
+    """
+    parameters, gradients = [networks.parameters], [networks.gradient]
+    means, squares = [torch.zeros_like(parameters[0])], [torch.zeros_like(parameters[0])]
+    # the kernel reads it in single precision, whatever the default is
+    counts = [torch.zeros((), dtype=torch.float32, device=parameters[0].device)]
+
+    def step(lr: float) -> None:
         adamw(
-            self._networks.parameters,
-            self._networks.gradients,
-            self._means,
-            self._squares,
+            parameters,
+            gradients,
+            means,
+            squares,
             [],
-            self._counts,
+            counts,
             fused=True,
             amsgrad=False,
             beta1=_BETAS[0],
             beta2=_BETAS[1],
-            lr=self._lr * _rate(self._made, self._count),
-            weight_decay=self._weight_decay,
+            lr=lr,
+            weight_decay=weight_decay,
             eps=_EPS,
             maximize=False,
         )
-        self._made += 1
+
+    return step
 
 
 def _rate(step: int, steps: int) -> float:
