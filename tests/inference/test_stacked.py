@@ -313,5 +313,8 @@ def test_states_of_one_factor_for_all_parameters_are_understood():
     net = posteriors()[0]
     state = net.state_dict()
     name = next(key for key in state if key.endswith("widening"))
-    net.load_state_dict(state | {name: torch.tensor(1.25)})
+    older = {key: value for key, value in state.items() if not key.endswith("contrast")}
+    net.network.contrast.fill_(1.5)
+    net.load_state_dict(older | {name: torch.tensor(1.25)})
     assert net.network.widening.tolist() == [1.25, 1.25]
+    assert net.network.contrast.tolist() == [1.0, 1.0]

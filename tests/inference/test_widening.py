@@ -1,5 +1,6 @@
 """The factors on deviations, where what the networks know is known."""
 
+import math
 from typing import Any
 
 import pytest
@@ -72,6 +73,50 @@ def test_each_parameter_gets_the_factor_that_it_lacks():
     noise = DEVIATION * torch.randn(4000, 2, generator=generator("held out"))
     pairs = TensorDict({"theta": noise, "summary": torch.zeros(4000, 1)}, [4000])
     assert widen([network], pairs).tolist() == pytest.approx([2.0, 1.0], abs=0.05)
+
+
+SHARP, VAGUE = 0.1, 0.4  # deviations of a network that tells two summaries apart
+
+
+def discerning():
+    """Return a network that answers N(0, SHARP^2) to a summary of 0, and N(0, VAGUE^2) to 10."""
+    network = MixtureDensityPosterior(PRIOR, 1, components=1, compress=False)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.zero_()
+        features, head = network.network.features, network.network.head
+        features.first.weight[0] = 1.0
+        head.bias[2] = 2 * math.log(SHARP)
+        head.weight[2, 0] = 2 * math.log(VAGUE / SHARP) / float(features(torch.tensor([10.0]))[0])
+    return network
+
+
+def told_apart(power, count=2000):
+    """Return pairs of both summaries, with deviations as far apart as this power makes them."""
+    sharp, middle = torch.arange(count) % 2 == 0, (SHARP * VAGUE) ** 0.5
+    deviation = middle * (torch.where(sharp, SHARP, VAGUE) / middle) ** power
+    theta = deviation[:, None] * torch.randn(count, 1, generator=generator("told apart"))
+    summary = torch.where(sharp, 0.0, 10.0)[:, None]
+    return TensorDict({"theta": theta, "summary": summary}, [count])
+
+
+@pytest.mark.parametrize("power", [0.7, 1.0, 1.5])
+def test_an_average_learns_how_much_sharper_sharp_answers_are(power):
+    networks = [discerning(), discerning()]
+    pairs = told_apart(power)
+    assert widen(networks, pairs).item() == pytest.approx(1.0, abs=0.05)
+    for network in networks:
+        assert network.network.contrast.item() == pytest.approx(power, abs=0.05)
+        found = network.distribution(torch.tensor([[0.0], [10.0]])).stddev[:, 0]
+        sharp = pairs["summary"][:, 0] == 0
+        for deviation, rows in zip(found.tolist(), (sharp, ~sharp), strict=True):
+            assert deviation == pytest.approx(pairs["theta"][rows].std().item(), rel=0.05)
+
+
+def test_a_network_alone_keeps_the_contrast_that_it_has():
+    network = discerning()
+    widen([network], told_apart(1.5))
+    assert network.network.contrast.item() == 1.0
 
 
 def test_a_few_pairs_move_the_factor_less_than_many():
