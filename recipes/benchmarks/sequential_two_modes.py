@@ -4,11 +4,12 @@ r"""Sequential inference of a posterior with two modes: how near the exact one, 
 observation 1: modes at -1 and +1. Three rounds, fresh seeds; the figure is the total variation
 between the last round's posterior and the exact one, by quadrature. ``finished`` is the share of
 seeds that give a posterior at all, ``within_0.1`` the share at most 0.1 away; a seed without a
-posterior counts as distance 1. With sbi installed, its NPE-A takes part with its own defaults and
+posterior counts as distance 1. ``all=0`` leaves out all corrections but the default one,
+``focused``. With sbi installed, its NPE-A takes part with its own defaults and
 the same number of simulations per round. Prints JSON lines, one for the distance and one for the
 seconds of each method::
 
-    python recipes/benchmarks/sequential_two_modes.py [seeds=100] [simulations=2000] [sbi=10]
+    python recipes/benchmarks/sequential_two_modes.py [seeds=100] [simulations=2000] [all=1] [sbi=10]
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.inference.sequential import CORRECTIONS, Correction, sequential
 from torchrl_bayessim.randomness import generator, isolated
 
+DEFAULTS = {"seeds": 100, "simulations": 2000, "all": 1, "sbi": 10}
 NOISE, OBSERVED, ROUNDS = 0.2, 1.0, 3
 # patience as long as the fit, so that the cosine of the learning rate reaches its end
 FIT = {"epochs": 50, "patience": 50, "batch_size": 500, "lr": 5e-3}
@@ -118,10 +120,10 @@ def measure(case: str, method: Callable[[int], LogDensity], seeds: int) -> None:
 
 def main(*arguments: str) -> None:
     """Measure every correction, then sbi."""
-    given = options(list(arguments), optional=["sbi"], seeds=100, simulations=2000, sbi=10)
+    given = options(list(arguments), optional=["all", "sbi"], **DEFAULTS)
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")  # the counts of repairs, which the tests read
-    for correction in CORRECTIONS:
+    for correction in CORRECTIONS if given["all"] else ("focused",):
         measure(
             correction,
             lambda seed, correction=correction: ours(correction, seed, given["simulations"]),
