@@ -9,7 +9,8 @@ posterior counts as distance 1. ``all=0`` leaves out all corrections but the def
 the same number of simulations per round. Prints JSON lines, one for the distance and one for the
 seconds of each method::
 
-    python recipes/benchmarks/sequential_two_modes.py [seeds=100] [simulations=2000] [all=1] [sbi=10]
+    python recipes/benchmarks/sequential_two_modes.py [seeds=100] [simulations=2000]
+        [all=1] [sbi=10]
 """
 
 from __future__ import annotations
