@@ -1,3 +1,5 @@
+import pickle
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -307,6 +309,50 @@ def test_a_short_fit_ends_with_the_loss_itself():
         assert PosteriorLoss(net)(data)["loss_posterior"].item() == pytest.approx(
             validation[0], abs=1e-4
         )
+
+
+def test_weights_in_one_place_are_not_trained_as_several():
+    net = posteriors()[0]
+    blocks = net.network.features.blocks
+    blocks[1].weight.data = blocks[0].weight.data
+    assert not alike([net.network])
+    own = posteriors()[0].network
+    own.features.forward = lambda x: 2 * type(own.features).forward(own.features, x)
+    assert not alike([own])
+
+
+def test_weights_may_lie_in_any_order():
+    nets = posteriors()[:2]
+    block = nets[0].network.features.blocks[1]
+    block.weight = torch.nn.Parameter(block.weight.detach().T.contiguous().T)
+    assert not block.weight.is_contiguous()
+    reports = [fit(net, pairs(), **OPTIONS) for net in (nets[0], posteriors()[0])]
+    assert reports[0].validation == pytest.approx(reports[1].validation, abs=1e-5)
+
+
+@pytest.mark.parametrize("features", ["residual", "fourier"])
+def test_a_fit_leaves_no_gradients(features):
+    net = posteriors(features=features)[0]
+    fit(net, pairs(), **OPTIONS)
+    assert all(parameter.grad is None for parameter in net.parameters())
+
+
+def test_a_contrast_belongs_to_its_factor_and_pickles_of_before_have_none():
+    net = posteriors()[0].network
+    net.contrast.fill_(1.5)
+    some = {key: value for key, value in net.state_dict().items() if key.startswith("features")}
+    net.load_state_dict(some, strict=False)
+    assert net.contrast.tolist() == [1.5, 1.5]
+    del net._buffers["contrast"]
+    again = pickle.loads(pickle.dumps(net))
+    assert again.contrast.tolist() == [1.0, 1.0]
+
+
+def test_no_contrast_makes_a_point_of_a_component():
+    net = posteriors()[0].network
+    raw = torch.full((1, sum(net.sizes)), -60.0)
+    mixture = net.widened(raw, torch.ones(2), torch.full((2,), 2.0))
+    assert mixture.scale_tril.norm(dim=-1).min().item() == pytest.approx(1e-4, rel=1e-3)
 
 
 def test_states_of_one_factor_for_all_parameters_are_understood():

@@ -178,6 +178,14 @@ def test_the_average_has_the_mean_density():
     assert average([one]) is one
 
 
+def test_of_very_many_pairs_those_count_that_have_weight():
+    pairs = held_out(5000)
+    pairs["weight"] = torch.full((5000,), 1e-9)
+    pairs["weight"][1::50] = 1.0
+    pairs["theta"][1::50] *= 2
+    assert widen([sure(DEVIATION)], pairs).item() > 1.6
+
+
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 def test_the_unit_of_the_weights_does_not_matter(unit):
     pairs = held_out(100)

@@ -144,9 +144,9 @@ def fit_several(
         posteriors: Changed in place; of the same keys.
         data: As for :func:`fit`.
         seeds: Of the minibatches, one for each; the split is the first's, if no other is given.
-        together: Whether their answers will be averaged: all get the factors on deviations that
-            the average needs, see :mod:`.widening`. With fewer than 50 effective pairs held out
-            each keeps its own: the few would choose them by chance.
+        together: Whether their answers will be averaged: all get the factors on deviations, and
+            their powers, that the average needs, see :mod:`.widening`. With fewer than 50 effective
+            pairs held out each keeps its own: the few would choose them by chance.
         options: Of :func:`fit`, but for its seed; the patience is that of all of them.
 
     Raises:

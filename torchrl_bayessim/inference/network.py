@@ -54,8 +54,8 @@ class MixtureDensityNetwork(nn.Module):
 
     shift: Tensor
     scale: Tensor
-    widening: Tensor  # of each parameter's deviations, where a fit was found too sure, shape (D,)
-    contrast: Tensor  # of their logarithms, where it was so of some summaries more, shape (D,)
+    widening: Tensor  # factor on each parameter's deviations that a fit ends with, shape (D,)
+    contrast: Tensor  # power to which they are raised before that, shape (D,)
 
     def __init__(
         self,
@@ -95,8 +95,16 @@ class MixtureDensityNetwork(nn.Module):
         widening = state_dict.get(f"{prefix}widening")
         if widening is not None and not widening.ndim:  # of before: one factor for all parameters
             state_dict[f"{prefix}widening"] = widening.expand_as(self.widening)
-        state_dict.setdefault(f"{prefix}contrast", torch.ones_like(self.contrast))
+        if widening is not None:  # of before: none
+            ones = torch.ones_like(state_dict[f"{prefix}widening"])
+            state_dict.setdefault(f"{prefix}contrast", ones)
         super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take a pickled network; those of before have no contrast."""
+        super().__setstate__(state)
+        if "contrast" not in self._buffers:
+            self.register_buffer("contrast", torch.ones_like(self.widening))
 
     def standardize_inputs(self, summaries: Tensor | Iterable[Tensor]) -> InputScaling:
         """Set the input scaling from training summaries ``(N, L)``, or from parts of them.
@@ -144,7 +152,8 @@ class MixtureDensityNetwork(nn.Module):
             contrast: Power to which they are raised before, in prior deviations, shape ``(D,)``.
         """
         logits, loc, deviation, slope = self.parts(raw)
-        deviation = WIDEST * torch.tanh(widening * deviation**contrast / WIDEST)
+        deviation = (widening * deviation**contrast).clamp(min=FLOOR**0.5)
+        deviation = WIDEST * torch.tanh(deviation / WIDEST)
         return Mixture(logits, loc, factor(deviation, slope))
 
     def parts(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

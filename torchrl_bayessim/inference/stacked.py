@@ -16,7 +16,6 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import silu
-from torch.nn.utils import parameters_to_vector
 
 from ..errors import message
 from .features import NeuralFeatures, ResidualFeatures
@@ -71,8 +70,10 @@ class OneNetwork:
             self._kept = copy.deepcopy(self._network.state_dict())
 
     def restore(self) -> None:
-        """Go back to the state that was kept last."""
+        """Go back to the state that was kept last, without gradients."""
         self._network.load_state_dict(self._kept)
+        for parameter in self.parameters:
+            parameter.grad = None
 
 
 class StackedNetworks:
@@ -101,7 +102,7 @@ class StackedNetworks:
         self._networks = networks
         self._residual = isinstance(networks[0].features, ResidualFeatures)
         # one tensor for whoever makes steps, and views of it for the layers
-        flat = [parameters_to_vector(_learned(network)) for network in networks]
+        flat = [torch.cat([p.reshape(-1) for p in _learned(network)]) for network in networks]
         self.parameters = torch.stack(flat).detach()
         self.gradient = torch.zeros_like(self.parameters)
         self._kept = self.parameters.clone()
@@ -222,22 +223,25 @@ def _learned(network: MixtureDensityNetwork) -> list[nn.Parameter]:
 def alike(networks: Sequence[MixtureDensityNetwork]) -> bool:
     """Return whether networks differ in the weights of their linear layers only.
 
-    They are chains of linear layers with SiLU between them, as the default ones.
+    They are chains of linear layers with SiLU between them, as the default ones, and nothing in
+    them has code of its own.
     """
     if not all(_layers(network) and _learned(network) for network in networks):
         return False
-    if any(_hooked(network) for network in networks):
+    if any(type(network) is not MixtureDensityNetwork or _hooked(network) for network in networks):
         return False
     weights = [layer.weight for network in networks for layer in _layers(network)]
     biases = [layer.bias for network in networks for layer in _layers(network)]
-    if len({id(p) for p in weights + biases}) < 2 * len(weights):
+    if len({p.data_ptr() for p in weights + biases}) < 2 * len(weights):
         return False  # some are shared
     first = _settings(networks[0])
     return all(_settings(network) == first for network in networks)
 
 
 def _hooked(network: MixtureDensityNetwork) -> bool:
-    """Return whether something wants to know of a pass, which no pass by hand would tell."""
+    """Return whether something wants to know of a pass, or changes it: none by hand would tell."""
+    if any("forward" in vars(module) for module in network.modules()):
+        return True
     on_modules = (
         hooks
         for module in network.modules()

@@ -42,7 +42,7 @@ _NARROWEST, _WIDEST = 0.5, 10.0
 _STEEPEST = 2.0  # power of deviations
 _NEAR = 0.15  # s: what a hundred pairs leave unsure
 _TOO_SURE = 1.1  # what a network alone needs, where the pairs are too few to say
-_MOST = 2000  # held-out pairs that are used
+_MOST = 2000  # held-out pairs that are used, those of the largest weight
 
 
 def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase) -> Tensor:
@@ -58,8 +58,7 @@ def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase)
     """
     first, alone = networks[0], len(networks) == 1
     weight = weights_of(held_out)
-    counting = (weight > 0).nonzero().flatten()
-    counting = counting[:: math.ceil(len(counting) / _MOST)]
+    counting = (-weight).argsort(stable=True)[: min(_MOST, int((weight > 0).sum()))]
     held_out, weight = held_out[counting], weight[counting]
     z = first.prior.standardize(held_out.get(first.theta_key).double())
     weight, pairs = (weight / weight.sum()).to(z), effective_sample_size(weight)
