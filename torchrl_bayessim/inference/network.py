@@ -93,11 +93,11 @@ class MixtureDensityNetwork(nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         widening = state_dict.get(f"{prefix}widening")
-        if widening is not None and not widening.ndim:  # of before: one factor for all parameters
-            state_dict[f"{prefix}widening"] = widening.expand_as(self.widening)
-        if widening is not None:  # of before: none
-            ones = torch.ones_like(state_dict[f"{prefix}widening"])
-            state_dict.setdefault(f"{prefix}contrast", ones)
+        if widening is not None:
+            if not widening.ndim:  # of before: one factor for all parameters
+                widening = state_dict[f"{prefix}widening"] = widening.expand_as(self.widening)
+            # of before: none
+            state_dict.setdefault(f"{prefix}contrast", torch.ones_like(widening))
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -133,14 +133,13 @@ class MixtureDensityNetwork(nn.Module):
 
     def forward(self, summary: Tensor) -> Mixture:
         """Return the mixture for summaries ``(*, L)``."""
-        return self.mixture(self.scaled(summary))
-
-    def mixture(self, scaled: Tensor) -> Mixture:
-        """Return the mixture for what :meth:`scaled` made of summaries, ``(*, L)``."""
-        return self.widened(self.raw(scaled), self.widening, self.contrast)
+        return self.widened(self.raw(self.scaled(summary)), self.widening, self.contrast)
 
     def raw(self, scaled: Tensor) -> Tensor:
-        """Return the last layer's values, from which :meth:`widened` makes the mixture."""
+        """Return the last layer's values for what :meth:`scaled` made of summaries, ``(*, L)``.
+
+        From them :meth:`widened` makes the mixture.
+        """
         return self.head(self.features(scaled))
 
     def widened(self, raw: Tensor, widening: Tensor, contrast: Tensor) -> Mixture:

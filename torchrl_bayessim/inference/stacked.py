@@ -56,8 +56,7 @@ class OneNetwork:
 
     def backpropagate(self, gradient: Tensor) -> None:
         """Set the parameters' gradients from the one by what :meth:`raw` returned last."""
-        for parameter in self.parameters:
-            parameter.grad = None
+        self._network.zero_grad()
         self._raw.backward(gradient[0].to(self._raw))
 
     def clip_gradients(self, largest: float) -> None:
@@ -72,8 +71,7 @@ class OneNetwork:
     def restore(self) -> None:
         """Go back to the state that was kept last, without gradients."""
         self._network.load_state_dict(self._kept)
-        for parameter in self.parameters:
-            parameter.grad = None
+        self._network.zero_grad()
 
 
 class StackedNetworks:
@@ -226,13 +224,13 @@ def alike(networks: Sequence[MixtureDensityNetwork]) -> bool:
     They are chains of linear layers with SiLU between them, as the default ones, and nothing in
     them has code of its own.
     """
-    if not all(_layers(network) and _learned(network) for network in networks):
+    chains = [_layers(network) for network in networks]
+    parameters = [p for chain in chains for layer in chain for p in (layer.weight, layer.bias)]
+    if not all(chains) or not any(parameter.requires_grad for parameter in parameters):
         return False
     if any(type(network) is not MixtureDensityNetwork or _hooked(network) for network in networks):
         return False
-    weights = [layer.weight for network in networks for layer in _layers(network)]
-    biases = [layer.bias for network in networks for layer in _layers(network)]
-    if len({p.data_ptr() for p in weights + biases}) < 2 * len(weights):
+    if len({parameter.data_ptr() for parameter in parameters}) < len(parameters):
         return False  # some are shared
     first = _settings(networks[0])
     return all(_settings(network) == first for network in networks)
@@ -268,4 +266,4 @@ def _settings(network: MixtureDensityNetwork) -> tuple[object, ...]:
     ]
     inputs = network.shift.tolist(), network.scale.tolist(), network.compress
     mixtures = network.covariance, network.components, network.reach
-    return type(network), mixtures, inputs, layers, parameters
+    return mixtures, inputs, layers, parameters
