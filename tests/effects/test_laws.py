@@ -1,5 +1,6 @@
 """Known answers of the laws, one by one."""
 
+import copy
 import math
 from types import SimpleNamespace
 
@@ -84,6 +85,37 @@ def test_a_drive_that_follows_within_the_step_acts_by_its_mean():
         effect("action_lag"),
         effect("action_lag", held=False),
     )
+
+
+@pytest.mark.parametrize("second", [0.2, 0.5])
+def test_two_filters_in_a_row_follow_their_differential_equations(second):
+    s, u = 0.17, (0.0, 1.0, 1.0, -0.5)
+    first, last, dt, means = 0.0, 0.0, 1e-5, []
+    for command in u[1:]:
+        reached = []
+        for _ in range(10_000):
+            first += dt / ((1 - second) * s) * (command - first)
+            last += dt / (second * s) * (first - last)
+            reached.append(last)
+        means.append(np.mean(reached))
+    values = changed("action_lag", s, *u, held=False, second=second)
+    assert values == pytest.approx([0.0, *means], abs=1e-4)
+    assert changed("action_lag", 0.0, *u, held=False, second=second) == list(u)
+
+
+@pytest.mark.parametrize("name", ["action_lag", "sensor_lag"])
+def test_two_filters_in_a_row_are_one_after_the_other(name):
+    once = changed(name, 0.15, *changed(name, 0.05, 0, 1, 3, 2))
+    assert changed(name, 0.2, 0, 1, 3, 2, second=0.25) == pytest.approx(once)
+    nearly = changed(name, 0.2, 0, 1, 3, 2, second=1e-3)
+    assert nearly == pytest.approx(changed(name, 0.2, 0, 1, 3, 2), abs=1e-3)
+
+
+def test_what_two_filters_show_is_undone_twice():
+    true = torch.sin(0.1 * torch.arange(60, dtype=torch.float64))[:, None]
+    law, strength = effect("sensor_lag", second=0.3), torch.tensor([0.1]).double()
+    back = restored_sequence(law, measured_sequence(law, true, strength, ROBOT), strength, ROBOT)
+    torch.testing.assert_close(back, true, rtol=0, atol=1e-9)
 
 
 def test_a_soft_saturation_takes_as_much_of_the_largest_command_and_little_of_small_ones():
@@ -438,6 +470,35 @@ def test_a_payload_at_the_end_is_what_mujoco_makes_of_a_point_mass_there():
         shape = getattr(bare, field).shape[1:]
         found = [models.read(field, (1, *at)).item() for at in np.ndindex(shape)]
         assert found == pytest.approx(expected.tolist(), abs=1e-7)
+
+
+def test_a_payload_beside_the_end_moves_its_hinge_as_a_point_mass_there_would():
+    """``r = (.15, 0, -.2) + (0, 0, -.1)`` from the hinge, and ``y × r`` of it to the side."""
+    point = POINT.replace(".3 0 -.3", f"{0.3 - 0.4 * 0.2:.3f} 0 {-0.3 - 0.4 * 0.15:.3f}")
+    bare, held = (mujoco.MjModel.from_xml_string(HELD.format(held=p)) for p in ("", point))
+    robot = robot_of(Task(model=bare, frame_skip=1))
+    models = written("payload", {"link": 0.25}, robot, at_end=True, aside=0.4)
+    model = copy.copy(bare)
+    for field in ("body_mass", "body_ipos", "body_inertia"):
+        values = getattr(model, field)
+        for at in np.ndindex(values.shape[1:]):
+            values[(1, *at)] = models.read(field, (1, *at)).item()
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    for angle in (-0.7, 0.0, 1.2):
+        pushed = []
+        for one in (model, held):
+            data = mujoco.MjData(one)
+            data.qpos[0] = angle
+            mujoco.mj_forward(one, data)
+            mass = np.zeros((1, 1))
+            mujoco.mj_fullM(one, data, mass)
+            pushed.append((mass.item(), data.qfrc_bias[0]))
+        assert pushed[0] == pytest.approx(pushed[1], abs=1e-6)
+
+
+def test_a_payload_that_is_spread_is_not_beside_an_end():
+    with pytest.raises(ValueError, match=r"aside=0\.4, at_end=False.*Try: at_end=True"):
+        effect("payload", aside=0.4)
 
 
 def test_a_body_without_an_end_of_its_own_carries_nothing_there():

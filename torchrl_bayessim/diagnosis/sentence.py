@@ -21,6 +21,8 @@ _BENT = {
     "hardening": ", hardening by {:.2g} x²", "rise": ", and {:+.2g} of it per unit of speed",
     "softness": ", softness {:.2g}", "bend": ", bent by {:+.2g}",
     "settling": ", settling at {:.2g} per second",
+    "second": ", {:.0%} of it in a second filter",
+    "aside": ", {:+.2g} of its distance beside the end",
 }  # fmt: skip
 
 

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from .effect import ActionEffect, Effect, Memory, Now, Reach
 from .history import delayed, empty_line, filled, read_line
-from .laws import bent, decay, quantized, within
+from .laws import SECOND_LAG, bent, decay, quantized, two_lags, within
 from .robot import Robot
 from .transmission import ServoDeadBand, ServoGain, servos
 
@@ -98,19 +98,28 @@ class ActionLag(ActionEffect):
     what it has reached is held. A drive's goes on within the step, where its mean is
     ``u + (s/Δ) (1 − e^{−Δ/s}) (a − u)``.
 
+    Of two such filters in a row, as of a motor's current and its controller, the first has
+    ``(1 − r) s`` and the second ``r s``: ``s`` is how late a steady change arrives (`two_lags`).
+
     Args:
         held: Whether it is the controller's.
+        second: ``r``, 0 to 0.5; 0 for one filter. A diagnosis fits it.
     """
 
     name, unit, group = "action_lag", "s", "timing"
 
-    def __init__(self, *, held: bool = True) -> None:
-        self.held = held
+    def __init__(self, *, held: bool = True, second: float = 0.0) -> None:
+        self.held, self.second = held, second
 
     def forms(self, seconds: float) -> tuple[Effect, ...]:
         """Return the controller's and the drive's."""
         del seconds
         return ActionLag(held=True), ActionLag(held=False)
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the share of the second filter."""
+        del reach
+        return SECOND_LAG
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.15 s."""
@@ -118,17 +127,36 @@ class ActionLag(ActionEffect):
 
     def start(self, action: Tensor) -> Memory:
         """Return no command yet."""
-        return {"last": torch.full_like(action, torch.nan)}
+        unknown = torch.full_like(action, torch.nan)
+        return {"first": unknown, "last": unknown} if self.second else {"last": unknown}
 
     def command(
         self, action: Tensor, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Tensor, Memory]:
         """Return what the drive has reached, or its mean over the step."""
+        if self.second:
+            return self._twice(action, strength, memory, now)
         behind = filled(memory["last"], action) - action
         left = decay(now.robot.dt, strength)
         reached = action + left * behind
         mean = reached if self.held else action + strength / now.robot.dt * (1 - left) * behind
         return mean, {"last": reached}
+
+    def _twice(
+        self, action: Tensor, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Tensor, Memory]:
+        """Return the same of two filters."""
+        before, behind = (filled(memory[name], action) - action for name in ("first", "last"))
+        times = (1 - self.second) * strength, self.second * strength
+        dt = now.robot.dt
+        left, further, through = two_lags(dt, *times)
+        first = left * before
+        if self.held:  # the second is given what the first has reached
+            last = first + further * (behind - first)
+            return action + last, {"first": action + first, "last": action + last}
+        last = further * behind + through * before
+        late = (times[0] * (before - first) + times[1] * (behind - last)) / dt
+        return action + late, {"first": action + first, "last": action + last}
 
 
 class DeadBand(ActionEffect):

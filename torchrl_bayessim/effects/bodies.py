@@ -8,6 +8,7 @@ from __future__ import annotations
 __all__ = ["ComShift", "GravityTilt", "LinkLength", "Payload", "TimeScale"]
 
 import math
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -15,7 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .effect import Effect, Fields, ModelEffect
+from ..errors import message
+from .effect import Effect, Fields, ModelEffect, Reach
 from .robot import Robot
 
 _ALONG = 1e-3  # of a length: how far a body's end may lie beside its axis
@@ -30,19 +32,36 @@ class Payload(ModelEffect):
     ``(|r|² I − r rᵀ) m s / (m + s)`` (parallel axes). Bodies for which that is not along their
     principal axes have no end.
 
+    What is held beside the end is at ``r + a w × r``, ``w`` the axis of the first hinge: in the
+    plane in which the body swings. About other axes it then has products of inertia, which are
+    left out.
+
     Args:
         at_end: Where it is.
+        aside: ``a``, only at the end. A diagnosis fits it.
+
+    Raises:
+        ValueError: It is to be beside an end at which it is not.
     """
 
     name, unit, group = "payload", "kg", "inertia"
 
-    def __init__(self, *, at_end: bool = False) -> None:
-        self.at_end = at_end
+    def __init__(self, *, at_end: bool = False, aside: float = 0.0) -> None:
+        if aside and not at_end:
+            expected = "a payload that is aside at the end (spread ones are where the body is)"
+            got = f"aside={aside:g}, at_end=False"
+            raise ValueError(message(expected, got, hint="at_end=True"))
+        self.at_end, self.aside = at_end, aside
 
     def forms(self, seconds: float) -> tuple[Effect, ...]:
         """Return both places."""
         del seconds
         return Payload(), Payload(at_end=True)
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return how far aside it is, at the end."""
+        del reach
+        return {"aside": (0.02, -1.0, 1.0)} if self.at_end else {}
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the names of bodies that move and have a mass (and an end)."""
@@ -66,7 +85,7 @@ class Payload(ModelEffect):
             fields[entry] = mass + added
             if not self.at_end:
                 continue
-            share, reach, arm = added / (mass + added), *_end(robot, body)
+            share, reach, arm = added / (mass + added), *_end(robot, body, self.aside)
             for axis in range(3):
                 place, about = ("body_ipos", (body, axis)), ("body_inertia", (body, axis))
                 fields[place] = fields[place] + share * float(reach[axis])
@@ -222,13 +241,22 @@ def _heavy(robot: Robot) -> list[int]:
     return [b for b in _moving(robot) if robot.require_model().body_mass[b] > 0]
 
 
-def _end(robot: Robot, body: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return ``r``, from a body's centre of mass to its end, in its own and its principal axes."""
+def _end(
+    robot: Robot, body: int, aside: float = 0.0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return ``r``, from a body's centre of mass to its end, in its own and its principal axes.
+
+    Or to what is beside the end, by so many lengths of ``r``.
+    """
     model = robot.require_model()
-    anchor = np.zeros(3)
+    anchor, axis = np.zeros(3), np.zeros(3)
     if model.body_jntnum[body]:
-        anchor = model.jnt_pos[model.body_jntadr[body]]
+        first = int(model.body_jntadr[body])
+        kinds = model.jnt_type[first : first + model.body_jntnum[body]]
+        hinge = first + int((kinds == mujoco.mjtJoint.mjJNT_HINGE).argmax())
+        anchor, axis = model.jnt_pos[first], model.jnt_axis[hinge]
     reach, arm, back = model.body_ipos[body] - anchor, np.zeros(3), np.zeros(4)
+    reach = reach + aside * np.cross(axis, reach)
     mujoco.mju_negQuat(back, model.body_iquat[body])
     mujoco.mju_rotVecQuat(arm, reach, back)
     return reach, arm

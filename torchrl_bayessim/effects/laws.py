@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-__all__ = ["bent", "decay", "quantized", "within"]
+__all__ = ["SECOND_LAG", "bent", "decay", "quantized", "two_lags", "within"]
+
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
+
+# a share of the time constant, as `Effect.free` has it
+SECOND_LAG: Mapping[str, tuple[float, float, float]] = {"second": (0.02, 0.0, 0.5)}
 
 
 def within(scale: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
@@ -13,9 +18,31 @@ def within(scale: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
     return scale * low, scale * high
 
 
+_ALIKE = 1e-6  # of a time constant: another that counts as the same
+
+
 def decay(dt: float, time_constant: Tensor) -> Tensor:
     """Return ``e^{−dt/T}``, what is left after ``dt``; zero for a time constant of zero."""
     return torch.exp(-dt / time_constant.clamp(min=0.0))
+
+
+def two_lags(dt: float, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what is left after ``dt`` of two lags in a row, and of the first in the second.
+
+    With ``T₁ ȧ = −a`` and ``T₂ ḃ = a − b``: ``a = e₁ a₀`` and ``b = e₂ b₀ + g a₀``, where
+    ``g = T₁ (e₁ − e₂) / (T₁ − T₂)``, for equal ones ``(dt / T) e^{−dt/T}``.
+
+    Example:
+        >>> one = torch.ones(1, dtype=torch.float64)
+        >>> [round(float(left), 4) for left in two_lags(1.0, 2 * one, one)]
+        [0.6065, 0.3679, 0.4773]
+    """
+    left, further = decay(dt, first), decay(dt, second)
+    apart = first - second
+    alike = apart.abs() <= _ALIKE * first
+    share = first * (left - further) / torch.where(alike, 1.0, apart)
+    equal = dt / torch.where(second > 0, second, 1.0) * further
+    return left, further, torch.where(alike, equal, share)
 
 
 def quantized(value: Tensor, step: Tensor) -> Tensor:

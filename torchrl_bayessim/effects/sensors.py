@@ -24,7 +24,7 @@ from torch import Tensor
 
 from .effect import Memory, Now, Reach, SensorEffect
 from .history import advanced, delayed, empty_line, filled, read_line
-from .laws import decay, quantized, within
+from .laws import SECOND_LAG, decay, quantized, within
 from .robot import Robot
 
 _LONGEST = 8  # control steps that a delay line remembers
@@ -146,9 +146,23 @@ class SensorQuantization(SensorEffect):
 
 
 class SensorLag(SensorEffect):
-    """A first-order filter, as many make velocities: ``y ← x + e^{−Δ/s} (y − x)``; to 0.1 s."""
+    """A first-order filter, as many make velocities: ``y ← x + e^{−Δ/s} (y − x)``; to 0.1 s.
+
+    Of two such filters in a row the first has ``(1 − r) s`` and the second ``r s``.
+
+    Args:
+        second: ``r``, 0 to 0.5; 0 for one filter. A diagnosis fits it.
+    """
 
     name, unit, group = "sensor_lag", "s", "timing"
+
+    def __init__(self, second: float = 0.0) -> None:
+        self.second = second
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the share of the second filter."""
+        del reach
+        return SECOND_LAG
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.1 s."""
@@ -156,21 +170,37 @@ class SensorLag(SensorEffect):
 
     def start(self, reading: Tensor) -> Memory:
         """Return no value yet."""
-        return {"last": torch.full_like(reading, torch.nan)}
+        unknown = torch.full_like(reading, torch.nan)
+        return {"first": unknown, "last": unknown} if self.second else {"last": unknown}
 
     def measure(
         self, reading: Tensor, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Tensor, Memory]:
-        """Return what the filter shows."""
-        last = filled(memory["last"], reading)
-        shown = reading + decay(now.robot.dt, strength) * (last - reading)
-        return shown, {"last": shown}
+        """Return what the filter shows, or the second of two."""
+        first, *second = self._kept(strength, now)
+        passed = _filtered(reading, first, memory["first" if second else "last"])
+        if not second:
+            return passed, {"last": passed}
+        shown = _filtered(passed, second[0], memory["last"])
+        return shown, {"first": passed, "last": shown}
 
     def restore(self, measured: Tensor, strength: Tensor, now: Now) -> Tensor:
-        """Return ``(y_k − e y_{k−1}) / (1 − e)``."""
-        kept = decay(now.robot.dt, strength).unsqueeze(-2)
-        before = torch.cat([measured[..., :1, :], measured[..., :-1, :]], -2)
-        return measured + kept / (1 - kept) * (measured - before)
+        """Return ``(y_k − e y_{k−1}) / (1 − e)``, of two filters twice."""
+        for kept in reversed(self._kept(strength, now)):
+            left = kept.unsqueeze(-2)
+            before = torch.cat([measured[..., :1, :], measured[..., :-1, :]], -2)
+            measured = measured + left / (1 - left) * (measured - before)
+        return measured
+
+    def _kept(self, strength: Tensor, now: Now) -> list[Tensor]:
+        """Return what each filter keeps of its last value."""
+        shares = (1 - self.second, self.second) if self.second else (1.0,)
+        return [decay(now.robot.dt, share * strength) for share in shares]
+
+
+def _filtered(value: Tensor, kept: Tensor, memory: Tensor) -> Tensor:
+    """Return a value after a first-order filter."""
+    return value + kept * (filled(memory, value) - value)
 
 
 class SensorDrift(SensorEffect):
