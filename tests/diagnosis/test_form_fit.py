@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from rail_cart import cart, ride
 from test_diagnose import ARM, logs
+from test_diagnose import system as robot
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.form_fit import _nearest_offered, _Shift, with_forms_anew
@@ -131,3 +132,24 @@ def test_what_is_straightened_is_a_law_that_was_offered_and_can_be_fitted(softne
 
 def unit_of(effect):
     return Unit(effect, "motor", (1.0,), 0.0, 1.0)
+
+
+def test_a_law_that_was_bent_to_make_up_for_a_second_cause_is_straight_beside_it():
+    """Alone, drag grows with the power 2.4 of speed, and no limit helps beside that drag."""
+    sent = {}
+
+    def act(u, k):
+        sent["u"] = float(u[k])
+        return u[k]
+
+    def push(_, v):
+        u, limit = sent["u"], 4.0 * max(1.0 - abs(v) / 9.0, 0.05)
+        lost = float(np.clip(u, -limit, limit)) - u if u * v > 0 else 0.0
+        return lost - 0.03 * v * abs(v)
+
+    names = ("quadratic_drag", "torque_speed_limit", "viscous_friction", "saturation")
+    report = diagnose(robot(), None, logs(8, act=act, push=push), effects=names)
+    assert {effect.name for effect in report.effects} == {"quadratic_drag", "torque_speed_limit"}
+    drag = next(effect for effect in report.effects if effect.name == "quadratic_drag")
+    assert drag.strength == pytest.approx(0.03, rel=0.1)
+    assert report.gap.with_effects < 1.3

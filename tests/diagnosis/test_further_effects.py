@@ -76,3 +76,26 @@ def test_what_comes_in_the_place_of_a_second_effect_is_no_third(strength, added)
     start, base = plain([], 1e6), plain([A, drift], 2400.0)
     better = plain({A: 1.0, drift: strength, magnets: 1.0}, 450.0)
     assert identified(start, base, better, [better]) == added
+
+
+@pytest.mark.parametrize(("left", "added"), [(4.2e5, True), (6.2e5, False)])
+def test_a_third_effect_takes_half_of_what_two_leave(left, added):
+    """A fifth and more of the gap, which would be enough for a second."""
+    start, base = plain([], 4e6), plain([A, C], 1e6)
+    better = plain([A, C, Unit("magnets")], left)
+    rival = plain([A, C, Unit("drag")], left, flipped=True)
+    assert identified(start, base, better, [better, rival]) == added
+    assert identified(start, plain([A], 1e6), plain([A, Unit("magnets")], left), [better])
+
+
+def test_what_a_rival_lacks_does_nothing_in_it():
+    start, base = plain([], 1e6), plain([A, C], 2400.0)
+    better = plain([A, Unit("magnets")], 450.0)
+    assert identified(start, base, better, [better])
+
+
+@pytest.mark.parametrize(("left", "added"), [(2.2e5, True), (4.2e5, False)])
+def test_two_effects_at_once_take_half_of_what_is_left_each(left, added):
+    start, base = plain([], 4e6), plain([A], 1e6)
+    better = plain([A, C, Unit("magnets")], left)
+    assert identified(start, base, better, [better]) == added

@@ -6,7 +6,9 @@ import torch
 from test_diagnose import logs, run, system
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
-from torchrl_bayessim.diagnosis.screening import crossing
+from torchrl_bayessim.diagnosis.objective import units_of
+from torchrl_bayessim.diagnosis.screening import _levels, crossing
+from torchrl_bayessim.effects.catalogue import effect
 
 
 class Quiet:
@@ -40,3 +42,13 @@ def test_below_the_lowest_level_norms_fall_as_they_do_above_it(norms, found):
     """In proportion, or faster: a tenth of the norm at 0.1 of the strength, or at 0.32 of it."""
     strengths = np.array([1.0, 10.0])
     assert crossing(strengths, np.array(norms), 1.0) == pytest.approx(found)
+
+
+def test_limits_are_compared_at_more_strengths_than_what_grows_steadily():
+    """Between a limit that is never reached and one that is always is a factor of a few."""
+    robot = system().robot
+    counts = {
+        name: len(_levels(units_of([effect(name)], robot)[0]))
+        for name in ("torque_speed_limit", "saturation", "coulomb_friction")
+    }
+    assert counts["torque_speed_limit"] == counts["saturation"] > counts["coulomb_friction"] == 2

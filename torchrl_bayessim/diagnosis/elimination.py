@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from .form_fit import bendable, priced, with_forms_anew
-from .model import Model, criterion, gain, judged, needed
+from .model import Model, as_good, criterion, gain, judged, needed
 from .objective import Objective, Point, Unit
 from .refit import refit
 
@@ -107,7 +107,7 @@ def parts(
 def without_stopgaps(
     train: Objective, validation: Objective, model: Model, offered: Collection[Unit]
 ) -> Model:
-    """Return the model without effects that others replace once their laws are fitted anew.
+    """Return the model without effects that others replace, or nearly, with laws fitted anew.
 
     A magnet's pull over a short way makes up for how a spring hardens, and beside it the spring
     need not harden.
@@ -126,8 +126,8 @@ def without_stopgaps(
         ]
         dispersion = model.dispersion()
         cost = partial(priced, train, offered=offered, dispersion=dispersion)
-        best = min([model, *smaller], key=cost)
-        if best is model:
+        instead = [m for m in smaller if cost(m) < cost(model) or as_good(model, m)]
+        if not instead:
             break
-        model = best
+        model = min(instead, key=cost)
     return model

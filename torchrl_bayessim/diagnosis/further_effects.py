@@ -21,7 +21,7 @@ from .model import LIKELY, Model, as_good, gain
 from .objective import Unit
 
 _SHARE = 0.1  # of the gap: what an effect that could be another must remove to be kept
-_REST = 0.5  # of what the base leaves: what any further effect must remove
+_REST = 0.5  # of what the base leaves: what any further effect must remove, each of two at once
 _LONE, _ALONE = 0.25, 4.0  # the same where it removes so many times what any other kind does
 _REMAINS = 0.01  # of the gap: not worth another effect
 _NUMERICAL = 3e-4  # of the gap: what a force that is 2 % off, by the integrator, may leave
@@ -54,14 +54,19 @@ def identified(
     if nothing_left(start, base):
         return False
     alone, before, after = (m.mean_square for m in (start, base, better))
-    if before - after > _SHARE * (alone - 1.0):
-        return True
     removed = (before - after) / max(before - 1.0, 1e-9)
+    # a third one mends the forms of two others more easily, and two at once more than one
+    known = {unit.name for unit in base.units}
+    count = max(len({unit.name for unit in better.units} - known), 1)
+    several = count > 1 or len(known) > 1
+    rest = 1.0 - (1.0 - _REST) ** count
+    if before - after > _SHARE * (alone - 1.0) and not (several and removed < rest):
+        return True
     added = _added(base, better)
     others = [m for m in models if not (_added(base, m) & added or _same(base, better, m))]
     next_best = before - min([before, *(m.mean_square for m in others)])
     lone = before - after > _ALONE * next_best
-    if removed < (_LONE if lone else _REST):
+    if removed < (_LONE if lone and count < 2 else rest):
         return False
     just_this = gain(base, better) > _SURELY and removed > 1.0 - _NOTHING
     if _leaves_less(start, base, _REMAINS):
@@ -75,6 +80,8 @@ def identified(
 
 def _does_something(unit: Unit, model: Model) -> bool:
     """Return whether a unit moves what a model predicts by more than chance would let it."""
+    if unit not in model.units:
+        return False
     return float((model.fit.change(unit) ** 2).sum()) > LIKELY
 
 

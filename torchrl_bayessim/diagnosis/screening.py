@@ -29,7 +29,7 @@ from .refit import Fit, with_prior
 
 Array = NDArray[np.float64]
 LEVELS = (0.05, 0.4)  # of an effect's range
-_BETWEEN = (0.08, 0.13, 0.2)  # where one period does not look like another
+_BETWEEN = (0.08, 0.13, 0.2)  # where one period, or one limit, does not look like another
 _WILD = 500.0  # standard deviations
 _POWER = 0.84  # of the normal distribution at 0.8, to state what would have been seen
 _HELD_OUT = 2.0  # times that, for other runs to show it too
@@ -194,8 +194,13 @@ def screen(objective: Objective, fit: Fit, units: Sequence[Unit]) -> Screen:
 
 
 def _levels(unit: Unit) -> tuple[float, ...]:
-    """Return the strengths to try, as shares of the unit's range."""
-    return LEVELS if unit.effect.search_power == 1 else tuple(sorted(LEVELS + _BETWEEN))
+    """Return the strengths to try, as shares of the unit's range.
+
+    A limit that is never reached is no limit, and one that is always reached hides what it does:
+    between them is little.
+    """
+    steady = unit.effect.search_power == 1 and not unit.effect.limit
+    return LEVELS if steady else tuple(sorted(LEVELS + _BETWEEN))
 
 
 def _is_wild(innovations: Array) -> bool:

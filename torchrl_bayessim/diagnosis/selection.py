@@ -246,8 +246,8 @@ def _fewest(
     several = len(_new_names(base, better)) > 1
     if several:
         smaller = _chosen(base, singles)
-        if smaller is None or not worth(smaller, better, models):
-            return smaller or better
+        if smaller is not None and not worth(smaller, better, models):
+            return smaller
     elif better.mean_square < WHITE:
         return better
     fitted = _in_other_forms(sets, base, singles, offered)
@@ -263,20 +263,24 @@ def _in_other_forms(
     singles: Sequence[Model],
     offered: Sequence[Unit],
 ) -> list[Model]:
-    """Return the best few models of one new effect whose law bends to the data, the best first."""
+    """Return the best few models of one new effect whose law bends to the data, the best first.
+
+    Whose law, or that of what is there already: what was bent to make up for the new effect is in
+    its way.
+    """
     train = sets[0]
     kinds: dict[str, Model] = {}
     for model in sorted(singles, key=lambda m: criterion(m, 1.0)):
-        if gain(base, model) > needed(base, model):
-            kinds.setdefault(_beyond(base, model)[0].name, model)
+        kinds.setdefault(_beyond(base, model)[0].name, model)
     laws = [u for u in offered if u.name in kinds and bendable(train, [u])]
-    bends = {unit.name for unit in laws}
+    bends = set(kinds) if bendable(train, base.units) else {unit.name for unit in laws}
     plain = [m for name, m in kinds.items() if name in bends]
     plain = plain[:_FORMS]
     softer = [point for m in plain for point in _as_offered(train, m, _beyond(base, m), laws)]
     plain += judged(*sets, refit(train, softer, iterations=4)) if softer else []
     tried = {m: with_fitted_forms(*sets, m, offered) for m in plain}
     fitted = [bent for plain, bent in tried.items() if bent is not plain]
+    fitted = [bent for bent in fitted if gain(base, bent) > needed(base, bent)]
     return sorted(fitted, key=lambda m: priced(sets[0], m, offered))
 
 
