@@ -80,7 +80,8 @@ def assemble(
         *scatter.candidates(system.robot),
     )
     parameters = _parameters(system, prepared, selection)
-    where, remainder = _locations(prepared, selection, credit, found.confused)
+    credited = unit_credit(selection, credit) | scatter.credited(found.effects, system.robot)
+    where, remainder = _locations(prepared, selection, credited, found.confused)
     rollouts = rollout_errors(prepared, points)
     units = _every_unit(selection, scatter)
     errors = run_errors(prepared.sets, prepared.logs, best.fit.point)
@@ -241,12 +242,11 @@ def _parameters(system: System, prepared: Prepared, selection: Selection) -> tup
 def _locations(
     prepared: Prepared,
     selection: Selection,
-    credit: Mapping[str, float],
+    found: Mapping[Unit, float],
     confused: Sequence[str],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return where the error sits before the effects, and after them."""
     train, judged = prepared.sets["train"], prepared.sets["validation"]
-    found = unit_credit(selection, credit)
 
     def left(model: Model) -> tuple[tuple[Objective, Array], tuple[Objective, Array]]:
         point = model.fit.point

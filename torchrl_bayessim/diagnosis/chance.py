@@ -59,6 +59,7 @@ class Chance:
         before: Mean square of the innovations of these segments without it, where they are others
             than those of the other figures.
         beside: Whether it acts beside the best explanation without chance, not in its place.
+        deviance: Of the segments that say what is lost, with it; infinite where others do.
     """
 
     unit: Unit
@@ -68,6 +69,7 @@ class Chance:
     left: Array
     before: float | None = None
     beside: bool = False
+    deviance: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)

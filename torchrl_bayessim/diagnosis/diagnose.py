@@ -28,16 +28,17 @@ from ..logs.system import System
 from ..physics.mujoco import MujocoPhysics
 from .assembly import assemble
 from .chance import chances, detectable, of_chance, unseen
-from .holds import bridged
+from .holds import Hold, bridged
 from .late_sensors import LATE, free_riders, without_free_riders
 from .losses import losses
+from .lost_commands import beside_lost_commands
 from .modes import MODES
 from .objective import Point, Unit, pushes_of, units_of
 from .onsets import with_onsets
 from .preparation import Prepared, prepare
 from .report import Report
-from .scatter import Scatter, gap_with_holds
-from .selection import select
+from .scatter import Scatter, gap_along, gap_with_holds
+from .selection import Selection, select
 from .shapes import SHAPED, shaped, with_shapes
 
 _ALPHA = 0.01
@@ -111,47 +112,80 @@ def diagnose(
         prepared = prepare(
             system, bridges, units, generator=generator, mode=told, horizon=horizon
         ).alarmed(*slow)
-        shapes = partial(_shapes, system, prepared, units)
-        units = with_shapes(units, shapes(prepared.nominal.point))
-        units = with_onsets(prepared.sets["train"], prepared.nominal.point, units)
-        search = partial(
-            select,
-            prepared.sets["train"],
-            prepared.sets["validation"],
-            prepared.nominal,
-            shapes=shapes,
-            alpha=_ALPHA,
-            generator=generator,
-            progress=progress,
-        )
-        selection = search(units)
-        seen = prepared.sets["train"], prepared.noise
-        if free_riders(*seen, selection.nominal, [selection.best]):
-            prepared = prepared.alarmed(_TOO_SHORT.format(prepared.horizon))
-            selection = search([unit for unit in units if unit.name not in LATE])
-        selection = without_free_riders(*seen, selection)
-        random = of_chance(every)
+        search = partial(_searched, system, units=units, generator=generator, progress=progress)
+        prepared, selection = search(prepared)
         progress("looking for scatter")
-        found = losses(prepared, selection, every) or chances(prepared.sets, selection, random)
-        hidden = [] if found else unseen(prepared.sets, selection, random)
-        least = detectable(prepared.sets["train"], selection, random)
+        prepared, selection, scatter = _scattered(
+            prepared, selection, logs, holds, units=every, search=search, generator=generator
+        )
         progress("opening the test runs")
         return assemble(
             system,
             prepared=prepared,
             selection=selection,
-            scatter=Scatter(
-                found,
-                least,
-                holds,
-                gap_with_holds(prepared, logs, selection) if holds else 1.0,
-                hidden,
-            ),
+            scatter=scatter,
             findings=findings,
             generator=generator,
             begun=begun,
             alpha=_ALPHA,
         )
+
+
+def _searched(
+    system: System,
+    prepared: Prepared,
+    *,
+    units: Sequence[Unit],
+    generator: np.random.Generator,
+    progress: Callable[[str], None],
+) -> tuple[Prepared, Selection]:
+    """Search for effects that last; an alarm where sensors that are late had to be left out."""
+    shapes = partial(_shapes, system, prepared, units)
+    units = with_shapes(units, shapes(prepared.nominal.point))
+    units = with_onsets(prepared.sets["train"], prepared.nominal.point, units)
+    search = partial(
+        select,
+        prepared.sets["train"],
+        prepared.sets["validation"],
+        prepared.nominal,
+        shapes=shapes,
+        alpha=_ALPHA,
+        generator=generator,
+        progress=progress,
+    )
+    selection = search(units)
+    seen = prepared.sets["train"], prepared.noise
+    if free_riders(*seen, selection.nominal, [selection.best]):
+        prepared = prepared.alarmed(_TOO_SHORT.format(prepared.horizon))
+        selection = search([unit for unit in units if unit.name not in LATE])
+    return prepared, without_free_riders(*seen, selection)
+
+
+def _scattered(
+    prepared: Prepared,
+    selection: Selection,
+    logs: Sequence[Log],
+    holds: Sequence[Hold],
+    *,
+    units: Sequence[Unit],
+    search: Callable[[Prepared], tuple[Prepared, Selection]],
+    generator: np.random.Generator,
+) -> tuple[Prepared, Selection, Scatter]:
+    """Look for effects of chance; where commands were lost, what was found beside that."""
+    random, recorded, arrived = of_chance(units), 1.0, False
+    found = losses(prepared, selection, units)
+    if holds:
+        recorded = gap_with_holds(prepared, logs, selection)
+    elif beside := beside_lost_commands(
+        prepared, selection, found, units=units, search=search, generator=generator
+    ):
+        sent, arrived = prepared.logs["test"], True
+        prepared, selection, found = beside.prepared, beside.selection, [beside.chance]
+        recorded = gap_along(prepared, sent, selection)
+    found = found or chances(prepared.sets, selection, random)
+    hidden = [] if found else unseen(prepared.sets, selection, random)
+    least = detectable(prepared.sets["train"], selection, random)
+    return prepared, selection, Scatter(found, least, holds, recorded, hidden, arrived)
 
 
 def _check_actuators(system: System) -> None:

@@ -84,6 +84,8 @@ def _with_chance(
     found: Found, scatter: Scatter, robot: Robot, generator: np.random.Generator
 ) -> Found:
     """Return the same with the effects of chance, beside those that last or in their place."""
+    if scatter.arrived:
+        return _with_arrivals(found, scatter, robot)
     if scatter.beside:
         measured = scatter.measured(found.measured, generator)
         if measured.explained - found.measured.explained > _WORTH:
@@ -108,20 +110,50 @@ def _with_holds(found: Found, scatter: Scatter) -> Found:
 
     What explains next to nothing of that is a stopgap for what bridges leave.
     """
-    measured, before = scatter.with_holds(found.measured), found.measured
+    measured, before = scatter.as_recorded(found.measured), found.measured
     gap = max(measured.refit - 1.0, 1e-9)
     if measured.refit - before.refit <= _WORTH * gap:
         return found
-    lasting, strengths, confused = found.effects, found.strengths, found.confused
     if before.refit - before.effects <= _WORTH * gap:
-        lasting, strengths, confused = (), {}, ()
-    smaller = max(before.refit - 1.0, 0.0) / gap
-    lasting = tuple(replace(e, share_of_gap=smaller * e.share_of_gap) for e in lasting)
-    (held,) = scatter.held_findings(measured, sum(e.share_of_gap for e in lasting))
-    effects = sorted([*lasting, held], key=lambda e: -e.share_of_gap)
-    first = effects[0] is held or not confused
-    strengths = {**strengths, SensorDropout(): dict(held.strengths)}
-    return Found(measured, tuple(effects), strengths, (held.name,) if first else confused)
+        found = replace(found, effects=(), strengths={}, confused=())
+    (held,) = scatter.held_findings(measured, _others(found, measured))
+    return _as_recorded(found, measured, held, {SensorDropout(): dict(held.strengths)})
+
+
+def _with_arrivals(found: Found, scatter: Scatter, robot: Robot) -> Found:
+    """Return the same with commands that were lost, of the gap with those that were sent."""
+    measured = scatter.as_recorded(found.measured)
+    (lost,) = scatter.findings(measured, robot, others=_others(found, measured))
+    return _as_recorded(found, measured, lost, scatter.strengths(robot))
+
+
+def _others(found: Found, measured: Shrinkage) -> float:
+    """Return the share of the gap as it was recorded that goes with what was found already."""
+    return _smaller(found, measured) * sum(effect.share_of_gap for effect in found.effects)
+
+
+def _smaller(found: Found, measured: Shrinkage) -> float:
+    """Return what share the gap that was compared has of the one that was recorded."""
+    return max(found.measured.refit - 1.0, 0.0) / max(measured.refit - 1.0, 1e-9)
+
+
+def _as_recorded(
+    found: Found,
+    measured: Shrinkage,
+    further: Finding,
+    strengths: Mapping[Effect, Mapping[str, float]],
+) -> Found:
+    """Return what was found with what explains the rest of the gap as it was recorded."""
+    smaller = _smaller(found, measured)
+    lasting = [replace(e, share_of_gap=smaller * e.share_of_gap) for e in found.effects]
+    effects = sorted([*lasting, further], key=lambda e: -e.share_of_gap)
+    first = effects[0] is further or not found.confused
+    return Found(
+        measured,
+        tuple(effects),
+        {**found.strengths, **strengths},
+        (further.name,) if first else found.confused,
+    )
 
 
 def _floor(selection: Selection, sets: Mapping[str, Objective]) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["Prepared", "prepare"]
+__all__ = ["Prepared", "prepare", "with_other_commands"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -128,21 +128,69 @@ def prepare(
     parts = _in_contact(predictor, parts, noise=noise, history=history)
     if horizon is None:
         horizon = mode.horizon(predictor, parts, units=units, noise=noise, history=history)
+    started = _Started(predictor, mode, history, horizon, noise, source, tuple(alarms))
+    prepared = started.fitted(parts, generator)
+    if few(logs):
+        return prepared
+    again = dealt_anew(parts, _by_log(parts, prepared.nominal, prepared.sets))
+    return prepared if again is parts else started.fitted(again, generator)
 
-    def fitted(parts: Mapping[str, list[Log]]) -> tuple[Fit, dict[str, Objective]]:
+
+def with_other_commands(
+    prepared: Prepared,
+    parts: Mapping[str, Sequence[Log]],
+    units: Sequence[Unit],
+    *,
+    generator: np.random.Generator,
+) -> Prepared:
+    """Return what a search starts from if other commands arrived than those that were sent.
+
+    Args:
+        prepared: With the commands that were sent.
+        parts: The logs of each split with those that arrived.
+        units: As in `prepare`.
+        generator: As in `prepare`.
+    """
+    history = prepared.sets["train"].segments.history
+    predictor, mode, alarms = prepared.predictor, prepared.mode, []
+    noise, source = mode.noise(predictor, parts["train"], history=history, alarms=alarms)
+    horizon = mode.horizon(predictor, parts, units=units, noise=noise, history=history)
+    started = _Started(predictor, mode, history, horizon, noise, source, prepared.alarms)
+    return started.fitted(parts, generator)
+
+
+@dataclass(frozen=True, eq=False)
+class _Started:
+    """What is settled before the parameters are fitted."""
+
+    predictor: Predictor
+    mode: Mode
+    history: int
+    horizon: int
+    noise: Array
+    source: str
+    alarms: tuple[str, ...]
+
+    def fitted(
+        self, parts: Mapping[str, Sequence[Log]], generator: np.random.Generator
+    ) -> Prepared:
+        """Cut the logs of each split, and fit the parameters."""
         pieces = {
-            name: mode.cut(part, horizon, history=history, most=max(12, _ROWS[name] // horizon))
+            name: self.mode.cut(
+                part,
+                self.horizon,
+                history=self.history,
+                most=max(12, _ROWS[name] // self.horizon),
+            )
             for name, part in parts.items()
         }
-        return _nominal(predictor, pieces, mode, noise=noise, generator=generator)
-
-    nominal, sets = fitted(parts)
-    if not few(logs):
-        again = dealt_anew(parts, _by_log(parts, nominal, sets))
-        if again is not parts:
-            parts = again
-            nominal, sets = fitted(parts)
-    return Prepared(predictor, sets, parts, noise, source, horizon, nominal, tuple(alarms), mode)
+        nominal, sets = _nominal(
+            self.predictor, pieces, self.mode, noise=self.noise, generator=generator
+        )
+        return Prepared(
+            self.predictor, sets, parts, self.noise, self.source, self.horizon, nominal,
+            self.alarms, self.mode,
+        )  # fmt: skip
 
 
 def _by_log(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["Scatter", "gap_with_holds"]
+__all__ = ["Scatter", "gap_along", "gap_with_holds"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from ..logs.log import Log
 from .chance import Chance
 from .contacts import settled
 from .holds import Hold
-from .objective import Point, Unit, strengths_of
+from .objective import Point, Unit, strengths_of, units_of
 from .preparation import Prepared
 from .report import Candidate, Finding
 from .selection import Selection
@@ -32,12 +32,18 @@ def gap_with_holds(prepared: Prepared, logs: Sequence[Log], selection: Selection
     test = prepared.sets["test"]
     if test.segments.uncertainty is not None:  # the held samples entered the estimates too
         return 1.0
-    size = len(test.segments)
     whole = split(logs)["test"]
     if test.segments.touching is not None:
         theta = test.theta(selection.nominal.fit.point.z)
         whole = settled(prepared.predictor, whole, theta=theta, noise=prepared.noise)
-    pieces = prepared.mode.cut(whole, prepared.horizon, history=test.segments.history, most=size)
+    return gap_along(prepared, whole, selection)
+
+
+def gap_along(prepared: Prepared, logs: Sequence[Log], selection: Selection) -> float:
+    """Return the mean squared innovation of test segments cut from other logs of the same runs."""
+    test = prepared.sets["test"]
+    size = len(test.segments)
+    pieces = prepared.mode.cut(logs, prepared.horizon, history=test.segments.history, most=size)
     if len(pieces) != size:
         return 1.0
     left = test.along(pieces)([selection.nominal.fit.point])[0]
@@ -52,15 +58,18 @@ class Scatter:
         found: Those that explain the scatter, the likeliest first.
         least: Of each that was looked for, the least strength that would have been seen.
         holds: Channels whose samples were not always renewed.
-        held: Mean squared innovation of test segments with the samples as they were recorded.
+        recorded: Mean squared innovation of test segments with samples and commands as they were
+            recorded, 1 where what was compared is that.
         hidden: Names of those that what was found to be late may be in truth.
+        arrived: Whether what was compared are the commands that are likely to have arrived.
     """
 
     found: Sequence[Chance]
     least: Mapping[Unit, float]
     holds: Sequence[Hold]
-    held: float
+    recorded: float
     hidden: Sequence[str] = ()
+    arrived: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -99,9 +108,9 @@ class Scatter:
             remainder_ci=(low - 1.0, high - 1.0),
         )
 
-    def with_holds(self, before: Shrinkage) -> Shrinkage:
-        """Return how far the gap of the samples as they were recorded shrinks."""
-        refit = max(self.held, before.refit)
+    def as_recorded(self, before: Shrinkage) -> Shrinkage:
+        """Return how far the gap of what was recorded shrinks."""
+        refit = max(self.recorded, before.refit)
         excess = max(refit - 1.0, 1e-9)
         share, high, low = (
             float(np.clip((excess - left) / excess, 0.0, 1.0))
@@ -166,6 +175,21 @@ class Scatter:
                 form=first.unit.effect.form,
             ),
         )
+
+    def credited(self, effects: Sequence[Finding], robot: Robot) -> dict[Unit, float]:
+        """Return effects of chance with their credit, where those that last have 1 together.
+
+        Args:
+            effects: What was found, as the report has it.
+            robot: Whose effects they are.
+        """
+        units = [chance.unit for chance in self.found[:1]]
+        if self.holds:
+            units += units_of([SensorDropout()], robot)
+        mine = {(unit.name, unit.where): unit for unit in units}
+        shares = {mine.get((e.name, e.where)): e.share_of_gap for e in effects}
+        others = sum(e.share_of_gap for e in effects if (e.name, e.where) not in mine)
+        return {u: share / max(others, 1e-3) for u, share in shares.items() if u is not None}
 
     def strengths(self, robot: Robot) -> dict[Effect, dict[str, float]]:
         """Return the strength of the likeliest by target, as `Report.apply` sets it."""

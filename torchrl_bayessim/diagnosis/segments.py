@@ -96,6 +96,7 @@ def cut(
     checks: int | None = None,
     burn_in: int = 0,
     skip: int = 0,
+    stride: int | None = None,
 ) -> Segments:
     """Cut logs into segments that follow one another.
 
@@ -110,6 +111,7 @@ def cut(
             what was commanded before; an eighth of the log at most.
         skip: Compare nothing in the first rows, half of the horizon at most: a sensor that lags
             shows there what was measured before the start, which is no prediction.
+        stride: Rows from one start to the next; default the horizon.
 
     Raises:
         ValueError: No log is longer than the horizon.
@@ -131,7 +133,7 @@ def cut(
     found = [
         (i, k)
         for i, log in enumerate(logs)
-        for k in range(min(burn_in, len(log) // 8), len(log) - horizon, horizon)
+        for k in range(min(burn_in, len(log) // 8), len(log) - horizon, stride or horizon)
     ]
     if not found:
         longest = max((len(log) for log in logs), default=0)

@@ -1,0 +1,110 @@
+"""Effects that last are found beside commands that were lost, on those that arrived."""
+
+import numpy as np
+import pytest
+import torch
+from test_chance import lost
+from test_diagnose import logs, system
+
+from torchrl_bayessim.diagnosis.arrivals import Arrivals
+from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.loss_law import LossLaw
+from torchrl_bayessim.diagnosis.lost_commands import beside_lost_commands
+from torchrl_bayessim.diagnosis.objective import Point, units_of
+from torchrl_bayessim.diagnosis.preparation import prepare
+from torchrl_bayessim.effects.action import PacketDrop
+
+SOME = (
+    "action_delay", "action_gain", "action_lag", "coulomb_friction", "dead_band", "packet_drop",
+    "sensor_dropout",
+)  # fmt: skip
+
+
+def jumps(share, seed, *, through=lambda u: u):
+    """Return commands that jump and are lost now and then, and the list of those that arrived."""
+    rng, noise, arrived = np.random.default_rng(seed), np.random.default_rng(99), []
+    arrives = lost(share, rng)
+
+    def act(u, k):
+        if k == 0:
+            u += noise.normal(size=len(u))
+            arrived.append([])
+        arrived[-1].append(arrives(u, k))
+        return through(arrived[-1][-1])
+
+    return act, arrived
+
+
+def test_commands_that_arrived_are_told_from_those_that_were_sent():
+    act, arrived = jumps(0.2, 1)
+    data = logs(8, act=act)
+    units = units_of([PacketDrop()], system().robot)
+    prepared = prepare(system(), data, units, generator=np.random.default_rng(0))
+    law = LossLaw(share=0.2, scatter=1.0, spoiled=0.01, size=16)
+    found = Arrivals(prepared, Point(prepared.nominal.point.z), [0], law).decided(prepared.logs)
+    true = {log.name: torch.tensor(one) for log, one in zip(data, arrived, strict=True)}
+    wrong, lost_ones, sent_wrong = 0.0, 0, 0.0
+    for split, part in found.items():
+        for log, sent in zip(part, prepared.logs[split], strict=True):
+            first = next(one for name, one in true.items() if log.name.startswith(name))
+            right = first[log.first_row : log.first_row + len(log)]
+            wrong += float((log.ctrl[:, 0] - right).abs().sum())
+            sent_wrong += float((sent.ctrl[:, 0] - right).abs().sum())
+            lost_ones += int((log.ctrl != sent.ctrl).sum())
+            assert set(log.ctrl[:, 0].tolist()) <= set(sent.ctrl[:, 0].tolist())
+    assert lost_ones > 200
+    assert wrong < 0.1 * sent_wrong
+
+
+@pytest.mark.parametrize(
+    ("name", "strength", "through", "push"),
+    [
+        ("dead_band", 0.5, lambda u: np.sign(u) * max(abs(u) - 0.5, 0.0), lambda q, v: 0.0),
+        ("coulomb_friction", 0.3, lambda u: u, lambda q, v: -0.3 * np.tanh(v / 0.01)),
+    ],
+)
+def test_another_cause_is_found_beside_lost_commands(name, strength, through, push):
+    act, _ = jumps(0.15, 2, through=through)
+    report = diagnose(system(), None, logs(8, act=act, push=push), effects=SOME)
+    assert report.verdict in {"named", "named_partial"}
+    found = {effect.name: effect for effect in report.effects}
+    assert set(found) == {name, "packet_drop"}
+    assert found[name].strength == pytest.approx(strength, rel=0.1)
+    assert found["packet_drop"].strength == pytest.approx(0.15, rel=0.5)
+    assert {effect.name for effect in report.strengths} == set(found)
+    shares = [effect.share_of_gap for effect in report.effects]
+    assert shares == sorted(shares, reverse=True)
+    assert min(shares) > 0.0
+    assert sum(shares) == pytest.approx(report.gap.explained_fraction, abs=1e-6)
+    assert report.confusion_set[0] == report.effects[0].name
+    assert report.gap.refit > 5.0  # of commands as they were sent
+    channels = report.where["channel"]
+    assert max(channels, key=channels.__getitem__) == "actuation"
+
+
+def test_losses_alone_sit_in_the_actuation():
+    act, _ = jumps(0.1, 3)
+    report = diagnose(system(), None, logs(8, act=act), effects=SOME)
+    assert [effect.name for effect in report.effects] == ["packet_drop"]
+    assert report.where["channel"]["actuation"] == pytest.approx(1.0)
+    assert report.where["joints"][0] == {"name": "hinge", "share": 1.0}
+
+
+def test_the_search_is_not_done_again_where_no_losses_are_evident(monkeypatch):
+    """Friction whose law no effect has is wrong everywhere, and some of that looks like losses."""
+
+    def search(*_):
+        pytest.fail("searched again")
+
+    seen = []
+
+    def watched(prepared, selection, found, **others):
+        seen.append(selection.best.mean_square)
+        assert (
+            beside_lost_commands(prepared, selection, found, **{**others, "search": search}) is None
+        )
+
+    monkeypatch.setattr("torchrl_bayessim.diagnosis.diagnose.beside_lost_commands", watched)
+    data = logs(6, push=lambda q, v: -0.4 * np.tanh(v / 0.3) * (1 + np.sin(9 * q)))
+    diagnose(system(), None, data, effects=SOME)
+    assert seen[0] > 3.0

@@ -1,0 +1,169 @@
+"""Which commands arrived, of those that were sent: decided on one after the other.
+
+A lost command leaves the last one that arrived in its place. Every command of a log is decided on
+by the ``H`` steps that follow from a measured state, in which all ``2^H`` patterns of losses are
+compared by their density (see `loss_law`); the first steps are settled by what is likeliest
+whatever happens after them, the others decided on again from the next start.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Arrivals"]
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from ..logs.log import Log
+from .loss_law import LossLaw
+from .loss_segments import command_slopes
+from .objective import Point
+from .preparation import Prepared
+from .segments import cut
+
+Array = NDArray[np.float64]
+_STEPS, _SETTLED = 8, 4  # of a segment, and of those the ones that are decided on
+_PATTERNS = np.array(list(product((False, True), repeat=_STEPS)))  # the first steps vary slowest
+
+
+@dataclass(frozen=True, eq=False)
+class Arrivals:
+    """What decides whether commands arrived.
+
+    Attributes:
+        prepared: Logs with the commands that were sent.
+        point: The simulator.
+        actuators: Those whose commands are lost together.
+        law: How losses come about.
+    """
+
+    prepared: Prepared
+    point: Point
+    actuators: Sequence[int]
+    law: LossLaw
+
+    def decided(self, known: Mapping[str, Sequence[Log]]) -> dict[str, list[Log]]:
+        """Return the logs of each split with the commands that are likely to have arrived.
+
+        Args:
+            known: With those that were taken to have arrived; what others do is linear from there.
+        """
+        sent = self.prepared.logs
+        return {name: self._decided(part, known[name]) for name, part in sent.items()}
+
+    def _decided(self, sent: Sequence[Log], known: Sequence[Log]) -> list[Log]:
+        number = [i for i, log in enumerate(sent) if len(log) > _STEPS]
+        if not number:
+            return list(known)
+        effects = _Effects.of(self, [sent[i] for i in number], [known[i] for i in number])
+        found = list(known)
+        for i, log in enumerate(number):
+            ctrl = effects.arrived(i, self.law)
+            found[log] = replace(sent[log], ctrl=torch.from_numpy(ctrl))
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Effects:
+    """What commands do in segments that overlap.
+
+    Attributes:
+        sent: Commands of each log, shape ``(T, nu)``.
+        known: Those from which changes are counted.
+        actuators: Those whose commands are lost together.
+        log: Which log each segment is from, shape ``(S,)``.
+        start: The row at which each starts, shape ``(S,)``.
+        left: Innovations, shape ``(S, M)``.
+        slopes: What a change of each command does, shape ``(S, M, A H)``.
+    """
+
+    sent: Sequence[Array]
+    known: Sequence[Array]
+    actuators: Sequence[int]
+    log: NDArray[np.int64]
+    start: NDArray[np.int64]
+    left: Array
+    slopes: Array
+
+    @classmethod
+    def of(cls, arrivals: Arrivals, sent: Sequence[Log], known: Sequence[Log]) -> _Effects:
+        """Simulate segments of some logs, and what a change of each command does to them."""
+        prepared, point = arrivals.prepared, arrivals.point
+        history = max(prepared.sets["train"].segments.history, 1)
+        pieces = cut(known, _STEPS, history=history, stride=_SETTLED)
+        prior, noise = prepared.predictor.system.prior, prepared.noise
+        objective = prepared.mode.objective(
+            prepared.predictor, prior, pieces, z=point.z, noise=noise
+        )
+        left = objective([point])[0]
+        commands = [log.ctrl.numpy() for log in sent]
+        rows = pieces.start[:, None] + np.arange(_STEPS)
+        told = np.stack([commands[i][k] for i, k in zip(pieces.log, rows, strict=True)])
+        at, slopes = history, []
+        for a in arrivals.actuators:
+            now = pieces.ctrl[:, at : at + _STEPS, a]
+            before = pieces.ctrl[:, at - 1 : at + _STEPS - 1, a]
+            others = np.where(now == told[..., a], before, told[..., a])
+            slopes.append(command_slopes(objective, point, left, a, others=others))
+        return cls(
+            sent=commands,
+            known=[log.ctrl.numpy() for log in known],
+            actuators=list(arrivals.actuators),
+            log=pieces.log,
+            start=pieces.start,
+            left=left,
+            slopes=np.concatenate(slopes, -1),
+        )
+
+    def arrived(self, log: int, law: LossLaw) -> Array:
+        """Return the commands of a log that are likely to have arrived, ``(T, nu)``."""
+        sent, found = self.sent[log][:, self.actuators], self.sent[log].copy()
+        held, mine = sent[0], np.flatnonzero(self.log == log)
+        for segment in mine:
+            at = int(self.start[segment])
+            paths = _paths(sent[at : at + _STEPS], held)
+            logs = self._density(int(segment), paths, law)
+            if at == 0:  # nothing is known from before the first
+                logs = np.where(_PATTERNS[:, 0], -np.inf, logs)
+            if segment == mine[-1]:
+                chosen, steps = int(logs.argmax()), _STEPS
+            else:
+                first = logsumexp(logs.reshape(1 << _SETTLED, -1), axis=1)
+                chosen, steps = int(first.argmax()) << (_STEPS - _SETTLED), _SETTLED
+            found[at : at + steps, self.actuators] = paths[chosen, :steps]
+            held = paths[chosen, steps - 1]
+        return found
+
+    def _density(self, segment: int, paths: Array, law: LossLaw) -> Array:
+        """Return the log density of a segment under each pattern of losses, ``(B,)``."""
+        at, lost = int(self.start[segment]), _PATTERNS.sum(1)
+        now = self.known[int(self.log[segment])][at : at + _STEPS, self.actuators]
+        change = (paths - now).transpose(0, 2, 1).reshape(len(paths), -1)
+        squares = ((self.left[segment] + change @ self.slopes[segment].T) ** 2).sum(-1)
+        prior = lost * np.log(law.share) + (_STEPS - lost) * np.log1p(-law.share)
+        return np.asarray(prior - 0.5 * squares / law.scatter)
+
+
+def _paths(sent: Array, held: Array) -> Array:
+    """Return what arrives of commands under every pattern, ``(B, H, A)``.
+
+    Args:
+        sent: Shape ``(H, A)``.
+        held: The one that arrived last before them, shape ``(A,)``.
+
+    Example:
+        >>> paths = _paths(np.arange(1.0, 9.0)[:, None], np.zeros(1))
+        >>> paths[0b10010000, :, 0]  # the first and the fourth are lost
+        array([0., 2., 3., 3., 5., 6., 7., 8.])
+    """
+    now = np.broadcast_to(held, (len(_PATTERNS), len(held)))
+    paths = np.empty((len(_PATTERNS), *sent.shape))
+    for t, command in enumerate(sent):
+        now = np.where(_PATTERNS[:, t, None], now, command)
+        paths[:, t] = now
+    return paths

@@ -1,0 +1,134 @@
+"""Effects that last, beside commands that were lost: each hides the other.
+
+What losses spoil is more than what many an effect does, and an effect that is missing spoils the
+segments in which no command was lost. Where losses are evident, whatever else there is, the search
+is done again on the commands that arrived (`arrivals`), which commands these are is decided on
+again in the simulator that it found, and so on. In the end losses have to explain the segments that
+have them in that simulator, by the standard that is theirs elsewhere (`losses`).
+"""
+
+from __future__ import annotations
+
+__all__ = ["Beside", "beside_lost_commands"]
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .arrivals import Arrivals
+from .chance import Chance
+from .elimination import parts
+from .losses import Evident, evident, lost_beside
+from .model import WHITE
+from .objective import Unit
+from .preparation import Prepared, with_other_commands
+from .selection import Selection
+
+_ROUNDS = 3  # of deciding which commands arrived and searching on
+_CERTAIN = 40.0  # deviance by which both together have to explain more than either
+_LARGEST = 300_000  # control steps simulated to decide on all commands
+_SIMULATED = 18  # for each row and actuator
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """What was found on the commands that arrived.
+
+    Attributes:
+        prepared: With those commands.
+        selection: The effects that last.
+        chance: The losses.
+    """
+
+    prepared: Prepared
+    selection: Selection
+    chance: Chance
+
+
+def beside_lost_commands(
+    prepared: Prepared,
+    selection: Selection,
+    found: Sequence[Chance],
+    *,
+    units: Sequence[Unit],
+    search: Callable[[Prepared], tuple[Prepared, Selection]],
+    generator: np.random.Generator,
+) -> Beside | None:
+    """Return effects that last and losses that explain more together than what was found.
+
+    Args:
+        prepared: Logs with the commands that were sent.
+        selection: The effects that last, found with those.
+        found: What was found of losses, beside them or in their place.
+        units: All effects at their targets.
+        search: Searches for effects that last.
+        generator: Of simulated noise.
+    """
+    seen = evident(prepared, selection, units)
+    if seen is None or _too_many(prepared, seen):
+        return None
+    best = _searched(prepared, selection, seen, units, search=search, generator=generator)
+    if best is None:
+        return None
+    lasting, chance = _needed(prepared, *best, seen)
+    if chance is None or chance.deviance > seen.without - _CERTAIN:
+        return None
+    if any(chance.deviance > one.deviance - _CERTAIN for one in found):
+        return None
+    return Beside(best[0], lasting, replace(chance, beside=True))
+
+
+def _needed(
+    sent: Prepared, arrived: Prepared, selection: Selection, seen: Evident
+) -> tuple[Selection, Chance | None]:
+    """Return the selection without effects that only mend wrong decisions, and the losses beside.
+
+    Judged with the commands as they were sent and all that may have been lost of them.
+    """
+    chance, sets = lost_beside(sent, selection.best, seen.unit), arrived.sets
+    while chance is not None and len({unit.name for unit in selection.best.units}) > 1:
+        smaller = parts(sets["train"], sets["validation"], selection.best)
+        found = [(lost_beside(sent, model, seen.unit), model) for model in smaller]
+        known = [(one.deviance, one, model) for one, model in found if one is not None]
+        least, one, model = min(known, key=lambda each: each[0], default=(np.inf, chance, None))
+        if model is None or least > chance.deviance + _CERTAIN:
+            break
+        names = {unit.name for unit in model.units}
+        others = {n: models for n, models in selection.alternatives.items() if n in names}
+        tried = (*selection.tried, *smaller)
+        chance = one
+        selection = replace(selection, best=model, alternatives=others, tried=tried)
+    return selection, chance
+
+
+def _too_many(prepared: Prepared, seen: Evident) -> bool:
+    rows = sum(len(log) for part in prepared.logs.values() for log in part)
+    return rows * _SIMULATED * len(seen.actuators) > _LARGEST
+
+
+def _searched(
+    prepared: Prepared,
+    sent: Selection,
+    seen: Evident,
+    units: Sequence[Unit],
+    *,
+    search: Callable[[Prepared], tuple[Prepared, Selection]],
+    generator: np.random.Generator,
+) -> tuple[Prepared, Selection] | None:
+    """Return what is found on the commands that arrived, if that explains more than as sent."""
+    lasting = [unit for unit in units if not unit.effect.random]
+    logs, point, law = prepared.logs, seen.point, seen.law
+    result, least = None, sent.best.mean_square
+    for _ in range(_ROUNDS):
+        logs = Arrivals(prepared, point, seen.actuators, law).decided(logs)
+        again = with_other_commands(prepared, logs, lasting, generator=generator)
+        again, selection = search(again)
+        if not selection.best.units or selection.best.mean_square >= least:
+            break
+        least = selection.best.mean_square
+        result, point = (again, selection), selection.best.fit.point
+        if least < WHITE:
+            break
+        law = replace(law, scatter=min(law.scatter, max(1.0, least)))
+    return result
