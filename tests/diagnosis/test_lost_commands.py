@@ -1,15 +1,18 @@
 """Effects that last are found beside commands that were lost, on those that arrived."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
+from plain_models import A, plain
 from test_chance import lost
 from test_diagnose import logs, system
 
 from torchrl_bayessim.diagnosis.arrivals import Arrivals
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.loss_law import LossLaw
-from torchrl_bayessim.diagnosis.lost_commands import beside_lost_commands
+from torchrl_bayessim.diagnosis.lost_commands import _matters, beside_lost_commands
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.preparation import prepare
 from torchrl_bayessim.effects.action import PacketDrop
@@ -108,3 +111,12 @@ def test_the_search_is_not_done_again_where_no_losses_are_evident(monkeypatch):
     data = logs(6, push=lambda q, v: -0.4 * np.tanh(v / 0.3) * (1 + np.sin(9 * q)))
     diagnose(system(), None, data, effects=SOME)
     assert seen[0] > 3.0
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "matters"), [(1.15, 1.0, False), (2.0, 1.25, True), (2.0, 1.75, False)]
+)
+def test_what_mends_a_little_of_wrong_decisions_is_no_effect(before, after, matters):
+    """Of 400 numbers."""
+    found = SimpleNamespace(nominal=plain([], 400 * before), best=plain([A], 400 * after))
+    assert _matters(found) == matters

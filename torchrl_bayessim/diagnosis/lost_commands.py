@@ -27,6 +27,7 @@ from .selection import Selection
 
 _ROUNDS = 3  # of deciding which commands arrived and searching on
 _CERTAIN = 40.0  # deviance by which both together have to explain more than either
+_HALF = 0.5  # of what parameters leave of the commands that arrived
 _LARGEST = 300_000  # control steps simulated to decide on all commands
 _SIMULATED = 18  # for each row and actuator
 
@@ -102,6 +103,12 @@ def _needed(
     return selection, chance
 
 
+def _matters(selection: Selection) -> bool:
+    """Return whether effects take half of what parameters leave, or wrong decisions may be all."""
+    before, after = (m.mean_square for m in (selection.nominal, selection.best))
+    return before > WHITE and before - after > _HALF * (before - 1.0)
+
+
 def _too_many(prepared: Prepared, seen: Evident) -> bool:
     rows = sum(len(log) for part in prepared.logs.values() for log in part)
     return rows * _SIMULATED * len(seen.actuators) > _LARGEST
@@ -124,7 +131,7 @@ def _searched(
         logs = Arrivals(prepared, point, seen.actuators, law).decided(logs)
         again = with_other_commands(prepared, logs, lasting, generator=generator)
         again, selection = search(again)
-        if not selection.best.units or selection.best.mean_square >= least:
+        if not _matters(selection) or selection.best.mean_square >= least:
             break
         least = selection.best.mean_square
         result, point = (again, selection), selection.best.fit.point
