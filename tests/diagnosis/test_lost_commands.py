@@ -2,12 +2,14 @@
 
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 from plain_models import A, plain
 from test_chance import lost
 from test_diagnose import logs, system
+from test_lost_values import TWO, run_of_two
 
 from torchrl_bayessim.diagnosis.arrivals import Arrivals
 from torchrl_bayessim.diagnosis.diagnose import diagnose
@@ -16,6 +18,8 @@ from torchrl_bayessim.diagnosis.lost_commands import _matters, beside_lost_comma
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.preparation import prepare
 from torchrl_bayessim.effects.action import PacketDrop
+from torchrl_bayessim.envs.task import Task
+from torchrl_bayessim.logs.system import System
 
 SOME = (
     "action_delay", "action_gain", "action_lag", "coulomb_friction", "dead_band", "packet_drop",
@@ -83,6 +87,32 @@ def test_another_cause_is_found_beside_lost_commands(name, strength, through, pu
     assert report.gap.refit > 5.0  # of commands as they were sent
     channels = report.where["channel"]
     assert max(channels, key=channels.__getitem__) == "actuation"
+
+
+def test_what_packets_of_several_commands_hide_leaves_them_their_share_of_the_gap():
+    """Half of what each removes alone and beside the other, and never more than there is."""
+    rng = np.random.default_rng(8)
+    band = lambda u: np.sign(u) * np.maximum(np.abs(u) - 0.5, 0.0)
+    data = [run_of_two(rng, f"run{i}", share=0.15, through=band) for i in range(6)]
+    robot = System(task=Task(model=mujoco.MjModel.from_xml_string(TWO), frame_skip=1))
+    report = diagnose(robot, None, data, effects=SOME, horizon=10)
+    found = {effect.name: effect for effect in report.effects}
+    assert set(found) == {"dead_band", "packet_drop"}
+    assert found["packet_drop"].where == "all"
+    assert min(effect.share_of_gap for effect in report.effects) > 0.05
+    shares = sum(effect.share_of_gap for effect in report.effects)
+    assert shares == pytest.approx(report.gap.explained_fraction, abs=1e-6)
+    assert report.gap.horizon_steps == 10
+    (note,) = [alarm for alarm in report.alarms if "taken to have been lost" in alarm]
+    assert "of 900 commands" in note
+
+
+def test_of_many_runs_some_are_decided_on(monkeypatch):
+    monkeypatch.setattr("torchrl_bayessim.diagnosis.lost_commands._LARGEST", 20_000)
+    act, _ = jumps(0.15, 2, through=lambda u: np.sign(u) * max(abs(u) - 0.5, 0.0))
+    report = diagnose(system(), None, logs(12, act=act), effects=SOME)
+    assert {effect.name for effect in report.effects} == {"dead_band", "packet_drop"}
+    assert any("was decided on in 6 of 12 runs" in alarm for alarm in report.alarms)
 
 
 def test_losses_alone_sit_in_the_actuation():

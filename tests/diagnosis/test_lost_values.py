@@ -201,14 +201,14 @@ TWO = """
 """
 
 
-def run_of_two(rng, name, *, share, steps=150):
+def run_of_two(rng, name, *, share, steps=150, through=lambda u: u):
     """Return a run whose packets, each with both commands, are lost now and then."""
     model = mujoco.MjModel.from_xml_string(TWO)
     data, sent, last, rows = mujoco.MjData(model), rng.normal(size=(steps, 2)), np.zeros(2), []
     for command in sent:
         rows.append(np.r_[data.qpos, data.qvel])
         last = command if rng.random() >= share else last
-        data.ctrl[:] = last
+        data.ctrl[:] = through(last)
         mujoco.mj_step(model, data)
     noise = rng.normal(size=(steps, 4)) * [1e-3, 1e-3, 1e-2, 1e-2]
     state = torch.from_numpy(np.array(rows) + noise)

@@ -17,6 +17,7 @@ from torchrl_bayessim.effects.effect import ActionEffect, SensorEffect
 from torchrl_bayessim.effects.fields import ModelFields
 from torchrl_bayessim.effects.forcing import Forcing
 from torchrl_bayessim.effects.history import advanced, delayed, empty_line, read_line
+from torchrl_bayessim.effects.laws import two_lags
 from torchrl_bayessim.effects.overlay import Overlay
 from torchrl_bayessim.effects.robot import Robot, robot_of
 from torchrl_bayessim.effects.sequence import (
@@ -101,6 +102,15 @@ def test_two_filters_in_a_row_follow_their_differential_equations(second):
     values = changed("action_lag", s, *u, held=False, second=second)
     assert values == pytest.approx([0.0, *means], abs=1e-4)
     assert changed("action_lag", 0.0, *u, held=False, second=second) == list(u)
+
+
+@pytest.mark.parametrize("second", [0.4999, 0.499999, 0.5])
+def test_filters_that_are_nearly_alike_are_as_sure_in_single_precision(second):
+    single, double = (
+        two_lags(0.1, *((share * torch.tensor([0.15])).to(kind) for share in (1 - second, second)))
+        for kind in (torch.float32, torch.float64)
+    )
+    torch.testing.assert_close([one.double() for one in single], list(double), rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize("name", ["action_lag", "sensor_lag"])

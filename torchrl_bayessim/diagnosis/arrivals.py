@@ -60,7 +60,7 @@ class Arrivals:
         number = [i for i, log in enumerate(sent) if len(log) > _STEPS]
         if not number:
             return list(known)
-        effects = _Effects.of(self, [sent[i] for i in number], [known[i] for i in number])
+        effects = _Overlapping.of(self, [sent[i] for i in number], [known[i] for i in number])
         found = list(known)
         for i, log in enumerate(number):
             ctrl = effects.arrived(i, self.law)
@@ -69,8 +69,8 @@ class Arrivals:
 
 
 @dataclass(frozen=True, eq=False)
-class _Effects:
-    """What commands do in segments that overlap.
+class _Overlapping:
+    """Segments that overlap, and what commands do in them.
 
     Attributes:
         sent: Commands of each log, shape ``(T, nu)``.
@@ -91,7 +91,7 @@ class _Effects:
     slopes: Array
 
     @classmethod
-    def of(cls, arrivals: Arrivals, sent: Sequence[Log], known: Sequence[Log]) -> _Effects:
+    def of(cls, arrivals: Arrivals, sent: Sequence[Log], known: Sequence[Log]) -> _Overlapping:
         """Simulate segments of some logs, and what a change of each command does to them."""
         prepared, point = arrivals.prepared, arrivals.point
         history = max(prepared.sets["train"].segments.history, 1)
@@ -124,19 +124,20 @@ class _Effects:
         """Return the commands of a log that are likely to have arrived, ``(T, nu)``."""
         sent, found = self.sent[log][:, self.actuators], self.sent[log].copy()
         held, mine = sent[0], np.flatnonzero(self.log == log)
-        for segment in mine:
+        ends = [*self.start[mine[1:]].tolist(), int(self.start[mine[-1]]) + _STEPS]
+        for segment, end in zip(mine, ends, strict=True):
             at = int(self.start[segment])
             paths = _paths(sent[at : at + _STEPS], held)
             logs = self._density(int(segment), paths, law)
             if at == 0:  # nothing is known from before the first
                 logs = np.where(_PATTERNS[:, 0], -np.inf, logs)
             if segment == mine[-1]:
-                chosen, steps = int(logs.argmax()), _STEPS
+                chosen = int(logs.argmax())
             else:
                 first = logsumexp(logs.reshape(1 << _SETTLED, -1), axis=1)
-                chosen, steps = int(first.argmax()) << (_STEPS - _SETTLED), _SETTLED
-            found[at : at + steps, self.actuators] = paths[chosen, :steps]
-            held = paths[chosen, steps - 1]
+                chosen = int(first.argmax()) << (_STEPS - _SETTLED)
+            found[at:end, self.actuators] = paths[chosen, : end - at]
+            held = paths[chosen, end - at - 1]
         return found
 
     def _density(self, segment: int, paths: Array, law: LossLaw) -> Array:

@@ -28,7 +28,7 @@ from ..logs.system import System
 from ..physics.mujoco import MujocoPhysics
 from .assembly import assemble
 from .chance import chances, detectable, of_chance, unseen
-from .holds import Hold, bridged
+from .holds import bridged
 from .late_sensors import LATE, free_riders, without_free_riders
 from .losses import losses
 from .lost_commands import beside_lost_commands
@@ -37,7 +37,7 @@ from .objective import Point, Unit, pushes_of, units_of
 from .onsets import with_onsets
 from .preparation import Prepared, prepare
 from .report import Report
-from .scatter import Scatter, gap_along, gap_with_holds
+from .scatter import Scatter, Sent, gap_with_holds
 from .selection import Selection, select
 from .shapes import SHAPED, shaped, with_shapes
 
@@ -113,17 +113,33 @@ def diagnose(
             system, bridges, units, generator=generator, mode=told, horizon=horizon
         ).alarmed(*slow)
         search = partial(_searched, system, units=units, generator=generator, progress=progress)
+        alarms = prepared.alarms
         prepared, selection = search(prepared)
         progress("looking for scatter")
-        prepared, selection, scatter = _scattered(
-            prepared, selection, logs, holds, units=every, search=search, generator=generator
-        )
+        random, found = of_chance(every), losses(prepared, selection, every)
+        sent, recorded = None, 1.0
+        if holds:
+            recorded = gap_with_holds(prepared, logs, selection)
+        elif beside := beside_lost_commands(
+            replace(prepared, alarms=alarms),
+            selection,
+            found,
+            units=every,
+            search=search,
+            generator=generator,
+        ):
+            selection, found = beside.selection, [beside.chance]
+            sent = Sent.along(beside.prepared, beside.sent, selection)
+            prepared = beside.prepared.alarmed(sent.note)
+        found = found or chances(prepared.sets, selection, random)
+        hidden = [] if found else unseen(prepared.sets, selection, random)
+        least = detectable(prepared.sets["train"], selection, random)
         progress("opening the test runs")
         return assemble(
             system,
             prepared=prepared,
             selection=selection,
-            scatter=scatter,
+            scatter=Scatter(found, least, holds, recorded, hidden, sent),
             findings=findings,
             generator=generator,
             begun=begun,
@@ -159,33 +175,6 @@ def _searched(
         prepared = prepared.alarmed(_TOO_SHORT.format(prepared.horizon))
         selection = search([unit for unit in units if unit.name not in LATE])
     return prepared, without_free_riders(*seen, selection)
-
-
-def _scattered(
-    prepared: Prepared,
-    selection: Selection,
-    logs: Sequence[Log],
-    holds: Sequence[Hold],
-    *,
-    units: Sequence[Unit],
-    search: Callable[[Prepared], tuple[Prepared, Selection]],
-    generator: np.random.Generator,
-) -> tuple[Prepared, Selection, Scatter]:
-    """Look for effects of chance; where commands were lost, what was found beside that."""
-    random, recorded, arrived = of_chance(units), 1.0, False
-    found = losses(prepared, selection, units)
-    if holds:
-        recorded = gap_with_holds(prepared, logs, selection)
-    elif beside := beside_lost_commands(
-        prepared, selection, found, units=units, search=search, generator=generator
-    ):
-        sent, arrived = prepared.logs["test"], True
-        prepared, selection, found = beside.prepared, beside.selection, [beside.chance]
-        recorded = gap_along(prepared, sent, selection)
-    found = found or chances(prepared.sets, selection, random)
-    hidden = [] if found else unseen(prepared.sets, selection, random)
-    least = detectable(prepared.sets["train"], selection, random)
-    return prepared, selection, Scatter(found, least, holds, recorded, hidden, arrived)
 
 
 def _check_actuators(system: System) -> None:

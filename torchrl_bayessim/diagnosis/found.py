@@ -4,7 +4,7 @@ from __future__ import annotations
 
 __all__ = ["Found"]
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from .model import gain, needed
 from .objective import Objective, Point, Unit, strengths_of
 from .preparation import Prepared
 from .report import Finding
-from .scatter import Scatter
+from .scatter import Scatter, Sent
 from .selection import Selection
 from .shrinkage import Shrinkage, shrinkage
 
@@ -84,12 +84,12 @@ def _with_chance(
     found: Found, scatter: Scatter, robot: Robot, generator: np.random.Generator
 ) -> Found:
     """Return the same with the effects of chance, beside those that last or in their place."""
-    if scatter.arrived:
-        return _with_arrivals(found, scatter, robot)
+    if scatter.sent is not None:
+        return _with_arrivals(found, scatter, scatter.sent, robot)
     if scatter.beside:
         measured = scatter.measured(found.measured, generator)
         if measured.explained - found.measured.explained > _WORTH:
-            others = found.measured.explained
+            others = max(found.measured.explained, 0.0)
             found = replace(
                 found,
                 measured=measured,
@@ -110,50 +110,40 @@ def _with_holds(found: Found, scatter: Scatter) -> Found:
 
     What explains next to nothing of that is a stopgap for what bridges leave.
     """
-    measured, before = scatter.as_recorded(found.measured), found.measured
+    measured, before = scatter.with_holds(found.measured), found.measured
     gap = max(measured.refit - 1.0, 1e-9)
     if measured.refit - before.refit <= _WORTH * gap:
         return found
     if before.refit - before.effects <= _WORTH * gap:
         found = replace(found, effects=(), strengths={}, confused=())
-    (held,) = scatter.held_findings(measured, _others(found, measured))
-    return _as_recorded(found, measured, held, {SensorDropout(): dict(held.strengths)})
+    smaller = max(before.refit - 1.0, 0.0) / gap
+    lasting = [replace(e, share_of_gap=smaller * e.share_of_gap) for e in found.effects]
+    (held,) = scatter.held_findings(measured, sum(e.share_of_gap for e in lasting))
+    known = {**found.strengths, SensorDropout(): dict(held.strengths)}
+    return _ranked(found, measured, [*lasting, held], known)
 
 
-def _with_arrivals(found: Found, scatter: Scatter, robot: Robot) -> Found:
+def _with_arrivals(found: Found, scatter: Scatter, sent: Sent, robot: Robot) -> Found:
     """Return the same with commands that were lost, of the gap with those that were sent."""
-    measured = scatter.as_recorded(found.measured)
-    (lost,) = scatter.findings(measured, robot, others=_others(found, measured))
-    return _as_recorded(found, measured, lost, scatter.strengths(robot))
+    measured = scatter.with_arrivals(found.measured, sent)
+    others = (1.0 - sent.share(found.measured)) * measured.explained
+    total = max(sum(effect.share_of_gap for effect in found.effects), 1e-9)
+    lasting = [replace(e, share_of_gap=others * e.share_of_gap / total) for e in found.effects]
+    (lost,) = scatter.findings(measured, robot, others=others)
+    known = {**found.strengths, **scatter.strengths(robot)}
+    return _ranked(found, measured, [*lasting, lost], known)
 
 
-def _others(found: Found, measured: Shrinkage) -> float:
-    """Return the share of the gap as it was recorded that goes with what was found already."""
-    return _smaller(found, measured) * sum(effect.share_of_gap for effect in found.effects)
-
-
-def _smaller(found: Found, measured: Shrinkage) -> float:
-    """Return what share the gap that was compared has of the one that was recorded."""
-    return max(found.measured.refit - 1.0, 0.0) / max(measured.refit - 1.0, 1e-9)
-
-
-def _as_recorded(
+def _ranked(
     found: Found,
     measured: Shrinkage,
-    further: Finding,
+    effects: Sequence[Finding],
     strengths: Mapping[Effect, Mapping[str, float]],
 ) -> Found:
-    """Return what was found with what explains the rest of the gap as it was recorded."""
-    smaller = _smaller(found, measured)
-    lasting = [replace(e, share_of_gap=smaller * e.share_of_gap) for e in found.effects]
-    effects = sorted([*lasting, further], key=lambda e: -e.share_of_gap)
-    first = effects[0] is further or not found.confused
-    return Found(
-        measured,
-        tuple(effects),
-        {**found.strengths, **strengths},
-        (further.name,) if first else found.confused,
-    )
+    """Return effects by their share of the gap as it was recorded, the last one new."""
+    ranked = sorted(effects, key=lambda e: -e.share_of_gap)
+    new = ranked[0] is effects[-1] or not found.confused
+    return Found(measured, tuple(ranked), strengths, (effects[-1].name,) if new else found.confused)
 
 
 def _floor(selection: Selection, sets: Mapping[str, Objective]) -> float:

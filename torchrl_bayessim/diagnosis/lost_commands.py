@@ -28,7 +28,8 @@ from .selection import Selection
 _ROUNDS = 3  # of deciding which commands arrived and searching on
 _CERTAIN = 40.0  # deviance by which both together have to explain more than either
 _HALF = 0.5  # of what parameters leave of the commands that arrived
-_LARGEST = 300_000  # control steps simulated to decide on all commands
+_LARGEST = 1_000_000  # control steps simulated to decide on all commands
+_SOME = "which commands arrived was decided on in {} of {} runs: all would have taken long"
 _SIMULATED = 18  # for each row and actuator
 
 
@@ -37,11 +38,13 @@ class Beside:
     """What was found on the commands that arrived.
 
     Attributes:
-        prepared: With those commands.
+        sent: The runs that were looked at, with the commands that were sent.
+        prepared: With those that arrived.
         selection: The effects that last.
         chance: The losses.
     """
 
+    sent: Prepared
     prepared: Prepared
     selection: Selection
     chance: Chance
@@ -67,9 +70,10 @@ def beside_lost_commands(
         generator: Of simulated noise.
     """
     seen = evident(prepared, selection, units)
-    if seen is None or _too_many(prepared, seen):
+    if seen is None:
         return None
-    best = _searched(prepared, selection, seen, units, search=search, generator=generator)
+    some = _fewer(prepared, len(seen.actuators))
+    best = _searched(some, selection, seen, search=search, generator=generator)
     if best is None:
         return None
     lasting, chance = _needed(prepared, *best, seen)
@@ -77,7 +81,7 @@ def beside_lost_commands(
         return None
     if any(chance.deviance > one.deviance - _CERTAIN for one in found):
         return None
-    return Beside(best[0], lasting, replace(chance, beside=True))
+    return Beside(some, best[0], lasting, replace(chance, beside=True))
 
 
 def _needed(
@@ -88,12 +92,12 @@ def _needed(
     Judged with the commands as they were sent and all that may have been lost of them.
     """
     chance, sets = lost_beside(sent, selection.best, seen.unit), arrived.sets
-    while chance is not None and len({unit.name for unit in selection.best.units}) > 1:
+    while len({unit.name for unit in selection.best.units}) > 1:
         smaller = parts(sets["train"], sets["validation"], selection.best)
         found = [(lost_beside(sent, model, seen.unit), model) for model in smaller]
         known = [(one.deviance, one, model) for one, model in found if one is not None]
         least, one, model = min(known, key=lambda each: each[0], default=(np.inf, chance, None))
-        if model is None or least > chance.deviance + _CERTAIN:
+        if model is None or (chance is not None and least > chance.deviance + _CERTAIN):
             break
         names = {unit.name for unit in model.units}
         others = {n: models for n, models in selection.alternatives.items() if n in names}
@@ -109,27 +113,35 @@ def _matters(selection: Selection) -> bool:
     return before > WHITE and before - after > _HALF * (before - 1.0)
 
 
-def _too_many(prepared: Prepared, seen: Evident) -> bool:
-    rows = sum(len(log) for part in prepared.logs.values() for log in part)
-    return rows * _SIMULATED * len(seen.actuators) > _LARGEST
+def _fewer(prepared: Prepared, actuators: int) -> Prepared:
+    """Return what was prepared, with some of the runs where to decide on all would take long."""
+    every = prepared.logs
+    rows = sum(len(log) for part in every.values() for log in part)
+    share = _LARGEST / (_SIMULATED * rows * actuators)
+    if share >= 1.0:
+        return prepared
+    some = {}
+    for name, part in every.items():
+        count = min(max(2, int(share * len(part))), len(part))
+        some[name] = [part[i] for i in np.linspace(0, len(part) - 1, count).round().astype(int)]
+    kept, total = (sum(map(len, parts.values())) for parts in (some, every))
+    return replace(prepared, logs=some).alarmed(_SOME.format(kept, total))
 
 
 def _searched(
     prepared: Prepared,
     sent: Selection,
     seen: Evident,
-    units: Sequence[Unit],
     *,
     search: Callable[[Prepared], tuple[Prepared, Selection]],
     generator: np.random.Generator,
 ) -> tuple[Prepared, Selection] | None:
     """Return what is found on the commands that arrived, if that explains more than as sent."""
-    lasting = [unit for unit in units if not unit.effect.random]
     logs, point, law = prepared.logs, seen.point, seen.law
     result, least = None, sent.best.mean_square
     for _ in range(_ROUNDS):
         logs = Arrivals(prepared, point, seen.actuators, law).decided(logs)
-        again = with_other_commands(prepared, logs, lasting, generator=generator)
+        again = with_other_commands(prepared, logs, generator=generator)
         again, selection = search(again)
         if not _matters(selection) or selection.best.mean_square >= least:
             break

@@ -139,23 +139,24 @@ def prepare(
 def with_other_commands(
     prepared: Prepared,
     parts: Mapping[str, Sequence[Log]],
-    units: Sequence[Unit],
     *,
     generator: np.random.Generator,
 ) -> Prepared:
     """Return what a search starts from if other commands arrived than those that were sent.
 
+    Over the same horizon, with a noise of its own: what commands spoil that were lost is none.
+
     Args:
         prepared: With the commands that were sent.
         parts: The logs of each split with those that arrived.
-        units: As in `prepare`.
         generator: As in `prepare`.
     """
-    history = prepared.sets["train"].segments.history
-    predictor, mode, alarms = prepared.predictor, prepared.mode, []
+    history, mode = prepared.sets["train"].segments.history, prepared.mode
+    predictor = prepared.predictor.divided(prepared.predictor.substeps)  # searches change theirs
+    predictor.steps, alarms = prepared.predictor.steps, list(prepared.alarms)
     noise, source = mode.noise(predictor, parts["train"], history=history, alarms=alarms)
-    horizon = mode.horizon(predictor, parts, units=units, noise=noise, history=history)
-    started = _Started(predictor, mode, history, horizon, noise, source, prepared.alarms)
+    alarms = tuple(dict.fromkeys(alarms))
+    started = _Started(predictor, mode, history, prepared.horizon, noise, source, alarms)
     return started.fitted(parts, generator)
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-__all__ = ["Scatter", "gap_along", "gap_with_holds"]
+__all__ = ["Scatter", "Sent", "gap_with_holds"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..effects.effect import Effect
 from ..effects.robot import Robot
@@ -17,9 +18,10 @@ from ..logs.log import Log
 from .chance import Chance
 from .contacts import settled
 from .holds import Hold
-from .objective import Point, Unit, strengths_of, units_of
+from .objective import Objective, Point, Unit, strengths_of, units_of
 from .preparation import Prepared
 from .report import Candidate, Finding
+from .segments import Segments
 from .selection import Selection
 from .shrinkage import Shrinkage
 from .splits import split
@@ -32,22 +34,89 @@ def gap_with_holds(prepared: Prepared, logs: Sequence[Log], selection: Selection
     test = prepared.sets["test"]
     if test.segments.uncertainty is not None:  # the held samples entered the estimates too
         return 1.0
-    whole = split(logs)["test"]
+    whole, size = split(logs)["test"], len(test.segments)
     if test.segments.touching is not None:
         theta = test.theta(selection.nominal.fit.point.z)
         whole = settled(prepared.predictor, whole, theta=theta, noise=prepared.noise)
-    return gap_along(prepared, whole, selection)
-
-
-def gap_along(prepared: Prepared, logs: Sequence[Log], selection: Selection) -> float:
-    """Return the mean squared innovation of test segments cut from other logs of the same runs."""
-    test = prepared.sets["test"]
-    size = len(test.segments)
-    pieces = prepared.mode.cut(logs, prepared.horizon, history=test.segments.history, most=size)
+    pieces = prepared.mode.cut(whole, prepared.horizon, history=test.segments.history, most=size)
     if len(pieces) != size:
         return 1.0
-    left = test.along(pieces)([selection.nominal.fit.point])[0]
-    return float((left**2).sum() / (test.whitening.weights**2).sum() / left.shape[1])
+    return float(_along(test, pieces, [selection.nominal.fit.point])[0])
+
+
+def _along(test: Objective, pieces: Segments, points: Sequence[Point]) -> NDArray[np.float64]:
+    """Return mean squared innovations of points on other segments of the same runs, ``(P,)``."""
+    left = test.along(pieces)(points)
+    total = np.asarray((left**2).sum((1, 2)), dtype=np.float64)
+    return total / (test.whitening.weights**2).sum() / left.shape[2]
+
+
+@dataclass(frozen=True)
+class Sent:
+    """Mean squared innovations of test segments with the commands that were sent.
+
+    Where others are taken to have arrived, on which everything else is compared.
+
+    Attributes:
+        raw: At the prior's mean.
+        refit: With fitted parameters.
+        effects: With the effects that last too.
+        lost: How many commands of all runs are taken to have been lost.
+        of: How many there are.
+    """
+
+    raw: float
+    refit: float
+    effects: float
+    lost: int
+    of: int
+
+    @classmethod
+    def along(cls, prepared: Prepared, sent: Prepared, selection: Selection) -> Sent:
+        """Return them for what was found on the commands that arrived.
+
+        Args:
+            prepared: With these.
+            sent: The same runs with those that were sent.
+            selection: What was found.
+        """
+        test, nominal = prepared.sets["test"], selection.nominal.fit.point
+        size, history = len(test.segments), test.segments.history
+        pieces = prepared.mode.cut(sent.logs["test"], prepared.horizon, history=history, most=size)
+        points = [Point(np.zeros_like(nominal.z)), nominal, selection.best.fit.point]
+        logs = [
+            pair
+            for name, part in sent.logs.items()
+            for pair in zip(part, prepared.logs[name], strict=True)
+        ]
+        lost = sum(int((one.ctrl != other.ctrl).any(1).sum()) for one, other in logs)
+        raw, refit, effects = _along(test, pieces, points).tolist()
+        return cls(raw, refit, effects, lost, sum(len(one) for one, _ in logs))
+
+    def share(self, arrived: Shrinkage) -> float:
+        """Return the share of the gap that losses have of what they and the effects remove.
+
+        The mean over which of the two comes first (Shapley 1953), at least nothing in either order.
+
+        Args:
+            arrived: How far the gap of the commands that arrived shrinks with the effects.
+
+        Example:
+            >>> sent = Sent(raw=9.0, refit=5.0, effects=3.0, lost=4, of=100)
+            >>> sent.share(Shrinkage(7.0, 3.0, 1.0, 1.0, (1.0, 1.0), (2.0, 2.0), (0.0, 0.0)))
+            0.5
+        """
+        alone = max(self.refit - arrived.refit, 0.0)
+        beside = max(self.effects - arrived.effects, 0.0)
+        return min(0.5 * (alone + beside) / max(self.refit - arrived.effects, 1e-9), 1.0)
+
+    @property
+    def note(self) -> str:
+        """What the reader must know."""
+        return (
+            f"{self.lost} of {self.of} commands are taken to have been lost; the gap without "
+            "causes is of those that were sent, all else, of test runs too, of those that arrived"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +127,10 @@ class Scatter:
         found: Those that explain the scatter, the likeliest first.
         least: Of each that was looked for, the least strength that would have been seen.
         holds: Channels whose samples were not always renewed.
-        recorded: Mean squared innovation of test segments with samples and commands as they were
-            recorded, 1 where what was compared is that.
+        recorded: Mean squared innovation of test segments with samples as they were recorded, 1
+            where what was compared is that.
         hidden: Names of those that what was found to be late may be in truth.
-        arrived: Whether what was compared are the commands that are likely to have arrived.
+        sent: Of the commands that were sent, where others are taken to have arrived.
     """
 
     found: Sequence[Chance]
@@ -69,7 +138,7 @@ class Scatter:
     holds: Sequence[Hold]
     recorded: float
     hidden: Sequence[str] = ()
-    arrived: bool = False
+    sent: Sent | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -108,9 +177,16 @@ class Scatter:
             remainder_ci=(low - 1.0, high - 1.0),
         )
 
-    def as_recorded(self, before: Shrinkage) -> Shrinkage:
-        """Return how far the gap of what was recorded shrinks."""
+    def with_holds(self, before: Shrinkage) -> Shrinkage:
+        """Return how far the gap of the samples as they were recorded shrinks."""
         refit = max(self.recorded, before.refit)
+        return self._from(before, max(before.raw, refit), refit)
+
+    def with_arrivals(self, before: Shrinkage, sent: Sent) -> Shrinkage:
+        """Return how far the gap of the commands as they were sent shrinks."""
+        return self._from(before, sent.raw, max(sent.refit, before.effects))
+
+    def _from(self, before: Shrinkage, raw: float, refit: float) -> Shrinkage:
         excess = max(refit - 1.0, 1e-9)
         share, high, low = (
             float(np.clip((excess - left) / excess, 0.0, 1.0))
@@ -118,7 +194,7 @@ class Scatter:
         )
         return replace(
             before,
-            raw=max(before.raw, refit),
+            raw=raw,
             refit=refit,
             explained=share,
             explained_ci=(low, high),

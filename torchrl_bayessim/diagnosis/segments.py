@@ -98,7 +98,7 @@ def cut(
     skip: int = 0,
     stride: int | None = None,
 ) -> Segments:
-    """Cut logs into segments that follow one another.
+    """Cut logs into segments that follow one another, or overlap.
 
     Args:
         logs: The logs.
@@ -111,7 +111,8 @@ def cut(
             what was commanded before; an eighth of the log at most.
         skip: Compare nothing in the first rows, half of the horizon at most: a sensor that lags
             shows there what was measured before the start, which is no prediction.
-        stride: Rows from one start to the next; default the horizon.
+        stride: Rows from one start to the next, so that segments overlap, and a last one up to the
+            log's end; default the horizon.
 
     Raises:
         ValueError: No log is longer than the horizon.
@@ -133,7 +134,7 @@ def cut(
     found = [
         (i, k)
         for i, log in enumerate(logs)
-        for k in range(min(burn_in, len(log) // 8), len(log) - horizon, stride or horizon)
+        for k in _starts(min(burn_in, len(log) // 8), len(log) - horizon, horizon, stride)
     ]
     if not found:
         longest = max((len(log) for log in logs), default=0)
@@ -168,6 +169,14 @@ def cut(
         uncertainty=_at(found, [log.uncertainty for log in logs]),
         touching=_touching(found, [log.touching for log in logs]),
     )
+
+
+def _starts(first: int, end: int, horizon: int, stride: int | None) -> list[int]:
+    """Return where segments start, before a row, with a last one there if they overlap."""
+    starts = list(range(first, end, stride or horizon))
+    if stride is not None and starts and starts[-1] < end - 1:
+        starts.append(end - 1)
+    return starts
 
 
 def of_velocities(logs: Sequence[Log]) -> tuple[Array, Array]:

@@ -243,7 +243,7 @@ def _fewest(
     if better is None:
         return None
     singles = [m for m in models if len(_new_names(base, m)) == 1]
-    several = len(_new_names(base, better)) > 1
+    several, smaller = len(_new_names(base, better)) > 1, None
     if several:
         smaller = _chosen(base, singles)
         if smaller is not None and not worth(smaller, better, models):
@@ -252,7 +252,8 @@ def _fewest(
         return better
     fitted = _in_other_forms(sets, base, singles, offered)
     if several:
-        return next((m for m in fitted if as_good(better, m)), better)
+        better = next((m for m in fitted if as_good(better, m)), better)
+        return smaller if smaller is not None and not worth(base, better, models) else better
     own = with_fitted_forms(*sets, better, offered)
     return min([own, *fitted], key=lambda m: priced(sets[0], m, offered))
 

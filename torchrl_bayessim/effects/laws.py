@@ -18,9 +18,6 @@ def within(scale: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:
     return scale * low, scale * high
 
 
-_ALIKE = 1e-6  # of a time constant: another that counts as the same
-
-
 def decay(dt: float, time_constant: Tensor) -> Tensor:
     """Return ``e^{−dt/T}``, what is left after ``dt``; zero for a time constant of zero."""
     return torch.exp(-dt / time_constant.clamp(min=0.0))
@@ -28,6 +25,8 @@ def decay(dt: float, time_constant: Tensor) -> Tensor:
 
 def two_lags(dt: float, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return what is left after ``dt`` of two lags in a row, and of the first in the second.
+
+    The second is the shorter one.
 
     With ``T₁ ȧ = −a`` and ``T₂ ḃ = a − b``: ``a = e₁ a₀`` and ``b = e₂ b₀ + g a₀``, where
     ``g = T₁ (e₁ − e₂) / (T₁ − T₂)``, for equal ones ``(dt / T) e^{−dt/T}``.
@@ -38,11 +37,11 @@ def two_lags(dt: float, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, 
         [0.6065, 0.3679, 0.4773]
     """
     left, further = decay(dt, first), decay(dt, second)
-    apart = first - second
-    alike = apart.abs() <= _ALIKE * first
-    share = first * (left - further) / torch.where(alike, 1.0, apart)
-    equal = dt / torch.where(second > 0, second, 1.0) * further
-    return left, further, torch.where(alike, equal, share)
+    some = torch.where(second > 0, second, 1.0)
+    apart = dt * (first - second) / (torch.where(first > 0, first, 1.0) * some)
+    # (1 - exp(-x)) / x, which loses nothing where lags are nearly equal
+    share = torch.where(apart > 0, -torch.expm1(-apart) / torch.where(apart > 0, apart, 1.0), 1.0)
+    return left, further, dt / some * left * share
 
 
 def quantized(value: Tensor, step: Tensor) -> Tensor:
