@@ -80,6 +80,16 @@ def test_losses_and_gradients_are_torchrls(kind, batch):
 
 
 @pytest.mark.parametrize("kind", LOSSES)
+def test_gradients_that_nobody_uses_are_not_worked_out(kind, batch):
+    loss = made(kind)
+    loss.policy_loss(batch).backward()
+    networks = loss._networks
+    assert all(p.grad is not None for p in networks.actor.parameters())
+    idle = [networks.judge, networks.critic, networks.target_actor, networks.target_critic]
+    assert all(p.grad is None for network in idle for p in network.parameters())
+
+
+@pytest.mark.parametrize("kind", LOSSES)
 def test_target_networks_follow_as_torchrls(kind):
     loss, twin = made(kind), made(kind)
     updaters = SoftUpdateAtOnce(loss, tau=0.1), SoftUpdate(twin, tau=0.1)

@@ -114,6 +114,8 @@ def test_the_policy_is_the_actor_that_learns(episodes):
         loss = learner._loss
         with loss.actor_network_params.to_module(loss.actor_network):
             torch.testing.assert_close(after, loss.actor_network.module(state))
+        keys = {key: episodes[key] for key in ("observation", "desired_goal")}
+        torch.testing.assert_close(learner.policy(**keys), after)
     assert not torch.allclose(before, after)
 
 

@@ -102,7 +102,7 @@ class _Bounded(LossModule):
         self._networks = _Networks(
             actor=_holding(self.actor_network, parameters["actor_network"]),
             critic=_holding(getattr(self, critic), parameters[critic]),
-            judge=_holding(getattr(self, critic), judge),
+            judge=_frozen(getattr(self, critic), judge),
             target_actor=_holding(self.actor_network, parameters["target_actor_network"]),
             target_critic=_holding(getattr(self, critic), parameters[f"target_{critic}"]),
         )
@@ -189,3 +189,8 @@ def _holding(network: Any, parameters: TensorDictBase) -> nn.Module:
     held = copy.deepcopy(network.module)
     parameters["module"].to_module(held)
     return held
+
+
+def _frozen(network: Any, parameters: TensorDictBase) -> nn.Module:
+    """Return the same without gradients of the parameters, which detached ones still collect."""
+    return _holding(network, parameters).requires_grad_(requires_grad=False)
