@@ -17,7 +17,7 @@ class Unit(NamedTuple):
 
     @property
     def effect(self):
-        return SimpleNamespace(group=self.name)
+        return SimpleNamespace(group=self.name, placed=())
 
 
 A, B, C = Unit("gain", "knee"), Unit("gain", "hip"), Unit("friction", "hip")

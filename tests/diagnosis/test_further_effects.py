@@ -48,6 +48,13 @@ def test_what_is_hardly_a_share_of_the_gap_is_named_if_one_effect_takes_all_of_i
     assert identified(start, base, better, [better]) == added
 
 
+@pytest.mark.parametrize(("units", "added"), [([Unit("drag")], True), ([A, Unit("drag")], False)])
+def test_two_in_the_place_of_one_are_one_more(units, added):
+    """Three fifths of what one leaves: enough for one more, and not for two."""
+    start, base, better = plain([], 1e6), plain([A], 20_000.0), plain([C, *units], 8_000.0)
+    assert identified(start, base, better, [better]) == added
+
+
 @pytest.mark.parametrize(("timestep", "added"), [(0.5, True), (2.0, False)])
 def test_a_delay_beside_a_cause_is_one_if_it_is_longer_than_a_time_step(timestep, added):
     class Delay(Unit):

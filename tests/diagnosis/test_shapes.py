@@ -5,6 +5,7 @@ import pytest
 from rail_cart import cart, ride
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.shapes import _sine
 
 SOME = ("cogging", "constant_force", "coulomb_friction", "parallel_spring", "periodic_disturbance")
 
@@ -36,3 +37,34 @@ def test_a_force_that_shakes_faster_than_segments_follow_each_other_is_no_slower
     (found,) = report.strengths
     assert found.frequency == pytest.approx(9.9, rel=5e-3)
     assert report.effects[0].strength == pytest.approx(0.9, rel=0.1)
+
+
+@pytest.mark.parametrize("phase", [0.3, 2.0, -2.6])
+def test_of_a_part_of_a_wave_the_mean_belongs_to_it(phase):
+    """Over 0.6 rad a sine of five per turn is much like others that are off by a constant."""
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(-0.1, 0.5, 100)
+    force = np.sin(5.0 * angle + phase)
+    noisy = force + 0.1 * rng.standard_normal(100)
+    rate, found = _sine(noisy, angle, np.arange(2.0, 25.0), offset=False)
+    wave = np.sin(rate * angle + found)
+    strength = float(wave @ force / (wave @ wave))
+    assert strength > 0
+    np.testing.assert_allclose(strength * wave, force, atol=0.1)
+
+
+def test_a_constant_is_no_wave():
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(-0.1, 0.5, 200)
+    force = 3.0 + 0.1 * rng.standard_normal(200)
+    assert _sine(force, angle, np.arange(2.0, 25.0), offset=False) is None
+
+
+@pytest.mark.parametrize("seed", [3, 7])
+def test_a_spring_that_is_off_center_is_no_wave(seed):
+    """A wave has three numbers, which over a part of its length do what two of a spring do."""
+    rng = np.random.default_rng(seed)
+    spring = lambda time, position: -3.0 * position - 0.6
+    logs = [ride(rng, 150, spring, noise=[0.002, 0.02]) for _ in range(6)]
+    report = diagnose(cart(), None, logs, effects=SOME)
+    assert {effect.name for effect in report.effects} == {"constant_force", "parallel_spring"}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 __all__ = [
     "bendable",
+    "fitted_numbers",
     "priced",
     "with_fitted_forms",
     "with_forms_anew",
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 
 from ..effects.effect import Reach
 from ..effects.units import slides
-from .model import LIKELY, WHITE, Model, criterion, judged, price
+from .model import LIKELY, WHITE, Model, criterion, judged, numbers, price
 from .objective import Objective, Point, Unit
 from .refit import Fit, refit, with_prior
 
@@ -44,9 +45,14 @@ class _Shift:
     least: float
     most: float
 
+    @property
+    def placed(self) -> bool:
+        """Whether it was read off the data before the effect was offered, and is priced with it."""
+        return self.number in self.unit.effect.placed
+
     def paid(self, offered: Collection[Unit]) -> bool:
         """Return whether it is fitted anyway, or has been: of a wave, or none that was offered."""
-        if not np.isfinite(self.least) or self.number in self.unit.effect.nuisances:
+        if self.placed or self.number in self.unit.effect.nuisances:
             return True
         return _value(self) not in self.offered(offered)
 
@@ -75,7 +81,7 @@ def with_fitted_forms(
     """
     sets = train, validation
     placed = _fitted(sets, model, lambda shift: shift.paid(offered))
-    count = sum(not shift.paid(offered) for shift in _shifts(train, placed))
+    count = sum(not shift.paid(offered) for shift in _shifts(train, placed.units))
     if not count:
         return placed
     needed = price(placed) * (_WHITER if placed.mean_square < WHITE else 1.0)
@@ -85,9 +91,7 @@ def with_fitted_forms(
 def bendable(train: Objective, units: Iterable[Unit]) -> bool:
     """Return whether the law of any of the units has a number that bends it."""
     return any(
-        np.isfinite(least)
-        for unit in units
-        for _, least, _ in unit.effect.free(_reach(train, unit)).values()
+        set(unit.effect.free(_reach(train, unit))) - set(unit.effect.placed) for unit in units
     )
 
 
@@ -95,8 +99,16 @@ def priced(
     train: Objective, model: Model, offered: Collection[Unit], *, dispersion: float = 1.0
 ) -> float:
     """Return the criterion, and a price for each number of a law that was fitted."""
-    count = sum(shift.paid(offered) for shift in _shifts(train, model))
-    return criterion(model, dispersion) + count * price(model)
+    return criterion(model, dispersion) + _bent(train, model, offered) * price(model)
+
+
+def fitted_numbers(train: Objective, model: Model, offered: Collection[Unit]) -> int:
+    """Return how many numbers its effects have that were fitted: strengths, and those of laws."""
+    return numbers(model) + _bent(train, model, offered)
+
+
+def _bent(train: Objective, model: Model, offered: Collection[Unit]) -> int:
+    return sum(s.paid(offered) and not s.placed for s in _shifts(train, model.units))
 
 
 def with_forms_anew(
@@ -108,7 +120,7 @@ def with_forms_anew(
     fitted from how they were offered, too, and stay that way unless the bent ones explain more.
     """
     sets, bent = (train, validation), with_fitted_forms(train, validation, model, offered)
-    shifts = [s for s in _shifts(train, model) if s.paid(offered) and np.isfinite(s.least)]
+    shifts = [s for s in _shifts(train, model.units) if s.paid(offered) and not s.placed]
     if not shifts:
         return bent
     changes = [_nearest_offered(shift, offered) - _value(shift) for shift in shifts]
@@ -129,7 +141,7 @@ def with_slopes_of_forms(train: Objective, model: Model, offered: Collection[Uni
     A strength is known less well beside them: a spring that is softer and hardens more is much the
     same spring.
     """
-    shifts = [shift for shift in _shifts(train, model) if shift.paid(offered)]
+    shifts = [shift for shift in _shifts(train, model.units) if shift.paid(offered)]
     if not shifts:
         return model
     return replace(model, fit=replace(model.fit, slopes=_slopes(train, model.fit, shifts)[0]))
@@ -152,7 +164,7 @@ def _fitted(
     """
     train, best = sets[0], model
     for _ in range(_STEPS):
-        shifts = [shift for shift in _shifts(train, best) if moves(shift)]
+        shifts = [shift for shift in _shifts(train, best.units) if moves(shift)]
         if not shifts:
             break
         whole, *shorter = _moved(train, best, shifts)
@@ -168,11 +180,11 @@ def _fitted(
     return best if model.fit.cost - best.fit.cost > needed else model
 
 
-def _shifts(train: Objective, model: Model) -> list[_Shift]:
+def _shifts(train: Objective, units: Iterable[Unit]) -> list[_Shift]:
     """Return what can be moved."""
     return [
         _Shift(unit, number, *bounds)
-        for unit in model.units
+        for unit in units
         for number, bounds in unit.effect.free(_reach(train, unit)).items()
     ]
 

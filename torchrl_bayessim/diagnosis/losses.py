@@ -86,12 +86,14 @@ class Evident:
         law: How they come about.
         point: The simulator in which they are likeliest.
         without: Deviance of the best explanation without losses.
+        segments: In which they are, of each split.
     """
 
     unit: Unit
     law: LossLaw
     point: Point
     without: float
+    segments: Mapping[str, LossSegments]
 
     @property
     def actuators(self) -> list[int]:
@@ -127,7 +129,7 @@ def evident(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> 
             plain = gained > _EVIDENT and _plain(law, judged)
             if plain and (likely is None or cost < likely[0]):
                 least = min(sum(other.costs) for _, other in bases)
-                likely = cost, Evident(unit, law, data[_JUDGED[0]].point, least)
+                likely = cost, Evident(unit, law, data[_JUDGED[0]].point, least, nominal)
     return None if likely is None else likely[1]
 
 
@@ -144,18 +146,17 @@ def _plain(law: LossLaw, judged: Sequence[Tried]) -> bool:
     return bool(told.before[concerned].mean() > _TIMES * told.after[concerned].mean())
 
 
-def lost_beside(prepared: Prepared, model: Model, unit: Unit) -> Chance | None:
+def lost_beside(seen: Evident, model: Model) -> Chance | None:
     """Return losses of commands beside the effects of a model, nothing if they may be those.
 
     Args:
-        prepared: Logs with the commands that were sent, noise and nominal fit.
+        seen: The losses that are evident, in segments with the commands that were sent.
         model: The effects.
-        unit: Whose commands are lost.
     """
     if not _apart(model.units):
         return None
-    data = {name: one.at(model.fit.point) for name, one in loss_segments(prepared).items()}
-    return _found(data, unit, _Alone.of(data), beside=True)
+    data = {name: one.at(model.fit.point) for name, one in seen.segments.items()}
+    return _found(data, seen.unit, _Alone.of(data), beside=True)
 
 
 def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> list[Chance]:

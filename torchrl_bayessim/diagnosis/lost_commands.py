@@ -76,7 +76,7 @@ def beside_lost_commands(
     best = _searched(some, selection, seen, search=search, generator=generator)
     if best is None:
         return None
-    lasting, chance = _needed(prepared, *best, seen)
+    lasting, chance = _needed(seen, *best)
     if chance is None or chance.deviance > seen.without - _CERTAIN:
         return None
     if any(chance.deviance > one.deviance - _CERTAIN for one in found):
@@ -85,16 +85,16 @@ def beside_lost_commands(
 
 
 def _needed(
-    sent: Prepared, arrived: Prepared, selection: Selection, seen: Evident
+    seen: Evident, arrived: Prepared, selection: Selection
 ) -> tuple[Selection, Chance | None]:
     """Return the selection without effects that only mend wrong decisions, and the losses beside.
 
     Judged with the commands as they were sent and all that may have been lost of them.
     """
-    chance, sets = lost_beside(sent, selection.best, seen.unit), arrived.sets
+    chance, sets = lost_beside(seen, selection.best), arrived.sets
     while len({unit.name for unit in selection.best.units}) > 1:
         smaller = parts(sets["train"], sets["validation"], selection.best)
-        found = [(lost_beside(sent, model, seen.unit), model) for model in smaller]
+        found = [(lost_beside(seen, model), model) for model in smaller]
         known = [(one.deviance, one, model) for one, model in found if one is not None]
         least, one, model = min(known, key=lambda each: each[0], default=(np.inf, chance, None))
         if model is None or (chance is not None and least > chance.deviance + _CERTAIN):

@@ -2,7 +2,18 @@
 
 from __future__ import annotations
 
-__all__ = ["LIKELY", "WHITE", "Model", "as_good", "criterion", "gain", "judged", "needed", "price"]
+__all__ = [
+    "LIKELY",
+    "WHITE",
+    "Model",
+    "as_good",
+    "criterion",
+    "gain",
+    "judged",
+    "needed",
+    "numbers",
+    "price",
+]
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -63,9 +74,14 @@ def judged(train: Objective, validation: Objective, fits: Sequence[Fit]) -> list
 
 
 def criterion(model: Model, dispersion: float) -> float:
-    """Return the deviance of all segments plus a price per strength; smaller is better."""
+    """Return the deviance of all segments plus a price per number; smaller is better."""
     total = float(model.deviances().sum())
-    return total / dispersion + len(model.units) * price(model)
+    return total / dispersion + numbers(model) * price(model)
+
+
+def numbers(model: Model) -> int:
+    """Return how many numbers its effects have: strengths, and what was read off for them."""
+    return sum(1 + len(unit.effect.placed) for unit in model.units)
 
 
 def price(model: Model) -> float:

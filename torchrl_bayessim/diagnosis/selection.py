@@ -22,6 +22,7 @@ from .elimination import eliminated, without_stopgaps
 from .explanations import bent, compare, explanations
 from .form_fit import (
     bendable,
+    fitted_numbers,
     priced,
     with_fitted_forms,
     with_forms_anew,
@@ -240,14 +241,14 @@ def _fewest(
 
     Or where that effect explains as much in another form, which others imitate.
     """
-    if better is None:
-        return None
     singles = [m for m in models if len(_new_names(base, m)) == 1]
+    if better is None:  # a law in a wrong form may fit some runs and predict no others
+        return next(iter(_in_other_forms(sets, base, singles, offered)), None)
     several, smaller = len(_new_names(base, better)) > 1, None
     if several:
         smaller = _chosen(base, singles)
         if smaller is not None and not worth(smaller, better, models):
-            return smaller
+            return better if _no_simpler(sets, smaller, better, offered) else smaller
     elif better.mean_square < WHITE:
         return better
     fitted = _in_other_forms(sets, base, singles, offered)
@@ -256,6 +257,21 @@ def _fewest(
         return smaller if smaller is not None and not worth(base, better, models) else better
     own = with_fitted_forms(*sets, better, offered)
     return min([own, *fitted], key=lambda m: priced(sets[0], m, offered))
+
+
+def _no_simpler(
+    sets: tuple[Objective, Objective], single: Model, pair: Model, offered: Sequence[Unit]
+) -> bool:
+    """Return whether a pair explains more than a single effect that has as many numbers.
+
+    A wave has a rate and a phase beside its strength, with which it is a spring that is off center.
+    """
+    train = sets[0]
+    fewest = fitted_numbers(train, pair, offered)
+    if fitted_numbers(train, single, offered) < fewest:
+        return False
+    single = with_fitted_forms(*sets, single, offered)
+    return priced(train, pair, offered) < priced(train, single, offered)
 
 
 def _in_other_forms(

@@ -78,6 +78,8 @@ def shaped(
             found.append(PeriodicDisturbance(frequency=best[0], phase=best[1]))
         rates = _waves(positions) if slides(system.robot, joint) else _NUMBERS
         best = _sine(force[:, i], positions[:, _STEPS // 2], rates)
+        if best is not None and best[0] * np.ptp(positions) < 2 * np.pi:
+            best = _sine(force[:, i], positions[:, _STEPS // 2], rates, offset=False)
         if best is not None:
             found.append(Cogging(number=best[0], phase=best[1]))
         units += [u for u in units_of(found, system.robot) if u.where == push.where]
@@ -149,15 +151,28 @@ def _rounding(force: Array, commands: Array, most: float) -> float | None:
     return choice
 
 
-def _sine(force: Array, angle: Array, rates: Array) -> tuple[float, float] | None:
-    """Return rate and phase of the sine of the angle that explains most, if it stands out."""
+def _sine(
+    force: Array, angle: Array, rates: Array, *, offset: bool = True
+) -> tuple[float, float] | None:
+    """Return rate and phase of the sine of the angle that explains most, if it stands out.
+
+    Args:
+        force: Shape ``(S,)``.
+        angle: Shape ``(S,)``.
+        rates: Of the angle, those that are tried.
+        offset: Whether the force has a constant beside the sine, which other effects may make. Of
+            a wave that is longer than the way, the mean over that is a part of the sine.
+    """
     target = _bounded(force)
     total = float((target**2).sum())
     best, choice = _CLEAR * total, None
+    mean = 0.0 if offset else float(_clipped(force).mean())
     for rate in rates:
-        columns = np.stack([np.sin(rate * angle), np.cos(rate * angle), np.ones_like(angle)], 1)
-        solution, *_ = np.linalg.lstsq(columns, target, rcond=None)
-        explained = total - float(((target - columns @ solution) ** 2).sum())
+        columns = np.stack([np.sin(rate * angle), np.cos(rate * angle)], 1)
+        if offset:
+            columns = np.c_[columns, np.ones_like(angle)]
+        solution, *_ = np.linalg.lstsq(columns, target + mean, rcond=None)
+        explained = total - float(((target + mean - columns @ solution) ** 2).sum())
         if explained > best:
             best = explained
             choice = float(rate), math.atan2(solution[1], solution[0])
@@ -166,6 +181,11 @@ def _sine(force: Array, angle: Array, rates: Array) -> tuple[float, float] | Non
 
 def _bounded(force: Array) -> Array:
     """Return the force without its mean and without what short segments make of single rows."""
-    bound = 4.0 * np.median(np.abs(force - np.median(force))) + 1e-12
-    bounded = np.clip(force - np.median(force), -bound, bound)
+    bounded = _clipped(force)
     return bounded - bounded.mean()
+
+
+def _clipped(force: Array) -> Array:
+    center = np.median(force)
+    bound = 4.0 * np.median(np.abs(force - center)) + 1e-12
+    return np.clip(force, center - bound, center + bound)

@@ -79,6 +79,7 @@ class PeriodicDisturbance(_Wave):
     """
 
     name, unit, group = "periodic_disturbance", "N m", "disturbance"
+    placed = ("frequency", "phase")
 
     def __init__(self, frequency: float = 1.0, phase: float = 0.0, **overtones: float) -> None:
         self.frequency = frequency
@@ -109,22 +110,29 @@ class Cogging(_Wave):
     Args:
         number: ``k``, periods per turn of a hinge, or per 2π m of a slide.
         phase: ``φ``, rad.
-        sine2: ``b₂``. A diagnosis fits these, with ``φ`` and a slide's ``k``.
+        sine2: ``b₂``. A diagnosis fits these, with ``k`` and ``φ``.
         cosine2: ``c₂``.
         sine3: ``b₃``.
         cosine3: ``c₃``.
     """
 
     name, unit, group = "cogging", "N m", "disturbance"
+    placed = ("number", "phase")
 
     def __init__(self, number: float = 6, phase: float = 0.0, **overtones: float) -> None:
         self.number = number
         super().__init__(phase, **overtones)
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
-        """Return all but a hinge's number, which has whole periods per turn."""
-        wider = {"number": (_MOVED / max(reach.position, 1e-9), *_ANY)} if reach.slides else {}
-        return {**wider, "phase": (_MOVED, *_ANY), **_OVERTONES}
+        """Return all of its options.
+
+        Of a slide at least half a period lies within its way: what is longer is a spring. A hinge
+        has at least two per turn, as one is gravity's; behind a gear they need not be whole.
+        """
+        way = 2 * max(reach.position, 1e-9)
+        least = math.pi / way if reach.slides else 2.0
+        number = 2 * _MOVED / way, least, math.inf
+        return {"number": number, "phase": (_MOVED, *_ANY), **_OVERTONES}
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the joints' names."""

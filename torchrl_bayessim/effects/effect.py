@@ -94,6 +94,8 @@ class Effect(ABC):
             what shows is a period and ``s`` its square, so that fast ones are told apart too.
         nuisances: Options of `free` of which no value is the usual one: fitted like strengths, and
             what is not known of them widens the intervals of strengths in any case.
+        placed: Options of a wave, read off the data before it is offered: numbers that it has
+            beside its strength, and that it is priced for.
     """
 
     name: ClassVar[str]
@@ -105,6 +107,7 @@ class Effect(ABC):
     limit: ClassVar[bool] = False
     search_power: ClassVar[float] = 1.0
     nuisances: ClassVar[tuple[str, ...]] = ()
+    placed: ClassVar[tuple[str, ...]] = ()
 
     def __eq__(self, other: object) -> bool:
         """Return whether the other is the same law with the same options."""
