@@ -5,7 +5,8 @@
 
 A generator of its own (its own stepping loop, laws and finer integration; nothing of the package)
 draws robots, causes, strengths, places, noise and excitation. Labels go to ``sealed/labels.json``,
-whose SHA-256 is printed and kept before the first diagnosis; the diagnosis is given a folder with
+whose SHA-256 is printed and kept before the first diagnosis, with what the methods were set on and
+what is scored; the diagnosis is given a folder with
 ``system.yaml``, the nominal model and CSV files. When all reports are written, the labels are
 opened, checked against the sum, and the reports are scored, once.
 
@@ -33,7 +34,7 @@ import numpy as np
 import recipe
 from baselines import methods
 from tqdm import tqdm
-from withheld import cases, folders, page, plans, scoring
+from withheld import cases, folders, frozen, page, plans, scoring
 from withheld.classes import class_of
 from withheld.comparison import compared
 from withheld.oracle import named_by_oracle
@@ -91,6 +92,8 @@ def job(settings: Withheld, out: Path) -> dict[str, Any]:
     seal = kept.read_text()
     check_sealed(sealed, seal)
     print(f"labels sealed: sha256 {seal}", flush=True)
+    lists = frozen.lists(settings.seed, robots, tiers)
+    print(frozen.told(lists), flush=True)
     names = sorted(path.name for path in (out / "cases").iterdir())
     for name in _progress(names, settings, "diagnosing"):
         if not (out / "reports" / f"{name}.json").exists():
@@ -103,7 +106,8 @@ def job(settings: Withheld, out: Path) -> dict[str, Any]:
     everyone = scored(settings, out, labels)
     records = everyone[DIAGNOSIS]
     write_text(out / "records.json", json.dumps(recipe.plain(records), indent=1))
-    result = scoring.scores(records, threshold=settings.threshold) | {"labels_sha256": seal}
+    result = scoring.scores(records, threshold=settings.threshold)
+    result |= {"labels_sha256": seal, "frozen": lists}
     if settings.baselines:
         write_text(out / "baselines.json", json.dumps(recipe.plain(everyone), indent=1))
         result["methods"] = compared(everyone, threshold=settings.threshold)

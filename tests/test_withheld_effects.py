@@ -653,6 +653,25 @@ def test_bad_settings_are_explained(tmp_path, monkeypatch, capsys):
         assert said in capsys.readouterr().err
 
 
+def test_a_run_says_what_the_methods_were_set_on_and_what_it_scores():
+    from withheld.frozen import lists, told
+
+    blind = lists(1, ["arm"], {"T0": 3, "T4": 1})
+    assert blind["blind"]
+    assert "soft_stop" in blind["scored"]["causes"]
+    assert not set(blind["scored"]["causes"]) & set(blind["set_on"]["causes"])
+    assert lists(1, ["arm"], {"T0": 3})["scored"]["causes"] == []
+    assert "dead_band" in lists(1, ["arm"], {"T5": 1})["scored"]["causes"]
+    known = lists(2214, ["arm"], {"T1": 1})
+    assert not known["blind"]
+    assert told(known).startswith("methods were set on: seeds 2211, 2213")
+    assert told(blind).splitlines()[1].startswith("scored: seeds 1; robots arm; causes ")
+    assert told(blind).endswith("no case of this seed was seen before")
+    assert told(known).endswith("its figures are not those of a blind run")
+    for folder in (RECIPES / "results" / "withheld_effects").glob("seed_*"):
+        assert not lists(int(folder.name.removeprefix("seed_")), ["arm"], {"T0": 1})["blind"]
+
+
 SHORT = ["robots=arm", "tiers=T0=1,T1=1", "progress=false", "seed=5"]
 
 
@@ -667,12 +686,12 @@ def test_it_seals_diagnoses_and_scores_and_does_so_again(
     assert done.returncode == 0, done.stderr
     import recipe
     import withheld_effects
+    from withheld import frozen
 
     again = tmp_path / "again"
-    again.mkdir()
     kept = json.loads((tmp_path / "run/sealed/labels.json").read_text())
     (kept,) = (name for name, label in kept.items() if label["tier"] == "T0")
-    (again / "reports").mkdir()  # all is done again but one diagnosis, to save its time
+    (again / "reports").mkdir(parents=True)  # all is done again but one diagnosis, to save its time
     shutil.copy(tmp_path / f"run/reports/{kept}.json", again / "reports")
     monkeypatch.setattr(sys, "argv", ["withheld_effects.py", *SHORT, f"out={again}"])
     recipe.main(withheld_effects.Withheld, withheld_effects.job)
@@ -684,6 +703,9 @@ def test_it_seals_diagnoses_and_scores_and_does_so_again(
     assert first == f"labels sealed: sha256 {digest}"
     result = json.loads(last.removeprefix("RESULT "))
     assert result["labels_sha256"] == digest
+    before = done.stdout.splitlines()[1:4]
+    assert before == frozen.told(result["frozen"]).splitlines()
+    assert all(line in (tmp_path / "run/page.md").read_text() for line in before)
     assert {"tiers", "where", "shrinkage", "seconds_per_case"} <= result.keys()
     assert result["tiers"]["T0"]["n"] == 1
     assert result["crashes"]["value"] == 0.0

@@ -15,6 +15,7 @@ from torchrl_bayessim.whole_file import write_text
 
 from .classes import CLASSES
 from .comparison import comparison_table
+from .frozen import told
 
 Record = dict[str, Any]
 _PLAIN = {"set_size", "mae", "median_error", "iou", "of_no_rule"}  # scores without an interval
@@ -26,6 +27,7 @@ def write_page(records: Sequence[Record], result: Mapping[str, Any], out: Path) 
         "# Blind check of the gap diagnosis",
         f"Labels sealed before the first diagnosis: `{result['labels_sha256']}`. Causes count as "
         f"visible from a detectability of {result['threshold']:g}; intervals are Wilson's, 95 %.",
+        *told(result["frozen"]).splitlines(),
         *_against(result),
         table(result),
         "By detectability (T1 and T2, class), beside one who knows the parameters, the noise and "
