@@ -119,6 +119,16 @@ def test_the_policy_is_the_actor_that_learns(episodes):
     assert not torch.allclose(before, after)
 
 
+def test_policies_are_kept_under_the_names_that_older_checkpoints_have(episodes):
+    learner = DDPG(push(), goal_reward, **SMALL)
+    names = learner.policy.state_dict()
+    assert {"module.0.module.low", "module.0.module.high"} <= names.keys()
+    assert "module.0.module.actor.layers.0.weight" in names
+    assert "module.0.module.state.normalizer.shift" in names
+    with pytest.raises(KeyError, match="desired_goal"):
+        learner.policy(episodes.exclude("desired_goal"))
+
+
 def test_exploration_is_part_uniform_and_part_noise():
     env = push(64)
     learner = DDPG(env, goal_reward, random_share=0.3, noise=0.05, **SMALL)

@@ -5,7 +5,9 @@ import pytest
 from rail_cart import cart, ride
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
-from torchrl_bayessim.diagnosis.shapes import _sine
+from torchrl_bayessim.diagnosis.shapes import _numbers, _sine
+from torchrl_bayessim.effects.disturbance import Cogging
+from torchrl_bayessim.effects.effect import Reach
 
 SOME = ("cogging", "constant_force", "coulomb_friction", "parallel_spring", "periodic_disturbance")
 
@@ -39,7 +41,7 @@ def test_a_force_that_shakes_faster_than_segments_follow_each_other_is_no_slower
     assert report.effects[0].strength == pytest.approx(0.9, rel=0.1)
 
 
-@pytest.mark.parametrize("phase", [0.3, 2.0, -2.6])
+@pytest.mark.parametrize("phase", [-2.6, -2.2, 0.6])
 def test_of_a_part_of_a_wave_the_mean_belongs_to_it(phase):
     """Over 0.6 rad a sine of five per turn is much like others that are off by a constant."""
     rng = np.random.default_rng(0)
@@ -51,6 +53,22 @@ def test_of_a_part_of_a_wave_the_mean_belongs_to_it(phase):
     strength = float(wave @ force / (wave @ wave))
     assert strength > 0
     np.testing.assert_allclose(strength * wave, force, atol=0.1)
+
+
+@pytest.mark.parametrize("turns", [0.5, 2.0, 6.0])
+def test_magnets_behind_a_gear_are_seen_however_far_a_hinge_turns(turns):
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(0.0, 2 * np.pi * turns, 400)
+    force = np.sin(6.25 * angle + 0.4) + 0.1 * rng.standard_normal(400)
+    number, _ = _sine(force, angle, _numbers(angle))
+    assert number == pytest.approx(6.25, abs=0.2)
+
+
+@pytest.mark.parametrize(("number", "slides"), [(1.0, False), (6.0, True)])
+def test_a_wave_that_was_given_is_not_too_long(number, slides):
+    least = Cogging(number).free(Reach(0.2, 1.0, 1.0, slides))["number"][1]
+    assert least == number
+    assert Cogging(20.0).free(Reach(0.2, 1.0, 1.0, slides))["number"][1] > least
 
 
 def test_a_constant_is_no_wave():

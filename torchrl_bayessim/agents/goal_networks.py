@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential, dispatch
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import Bounded
 from torchrl.envs import EnvBase
@@ -108,27 +108,38 @@ class Critic(nn.Module):
         return self.layers(torch.cat([state, action], -1))
 
 
-class _Scaled(TensorDictModuleBase):
-    """The actor behind its normalised inputs and before the action's bounds.
-
-    It writes the action itself: `TensorDictModule` asks at every call what kind of thing it is
-    given, for as long as the actor takes.
-    """
+class _Scaled(nn.Module):
+    """The actor behind its normalised inputs and before the action's bounds."""
 
     low: Tensor
     high: Tensor
 
     def __init__(self, state: GoalState, actor: Actor, low: Tensor, high: Tensor) -> None:
         super().__init__()
-        self.in_keys, self.out_keys = list(state.keys), ["action"]
         self.state, self.actor = state, actor
         self.register_buffer("low", low)
         self.register_buffer("high", high)
 
-    @dispatch(auto_batch_size=False)
+    def forward(self, observation: Tensor, desired_goal: Tensor) -> Tensor:
+        unit = self.actor(self.state(observation, desired_goal))
+        return self.low + (unit + 1) / 2 * (self.high - self.low)
+
+
+class _Acting(TensorDictModuleBase):
+    """Writes what a network makes of the actor's input.
+
+    `TensorDictModule` asks at every call what kind of thing it is given, for as long as the actor
+    takes.
+    """
+
+    def __init__(self, module: _Scaled) -> None:
+        super().__init__()
+        self.module = module
+        self.in_keys, self.out_keys = list(module.state.keys), ["action"]
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        unit = self.actor(self.state(*(tensordict.get(key) for key in self.in_keys)))
-        return tensordict.set("action", self.low + (unit + 1) / 2 * (self.high - self.low))
+        seen: list[Tensor] = [tensordict[key] for key in self.in_keys]
+        return tensordict.set("action", self.module(*seen))
 
 
 def goal_policy(
@@ -148,7 +159,7 @@ def goal_policy(
     half: Any = ((high - low) / 2).tolist()  # of one environment
     gaussian = AdditiveGaussianModule(spec, sigma_init=noise, sigma_end=noise, std=half)
     uniform = EGreedyModule(spec, eps_init=random_share, eps_end=random_share)
-    parts: list[Any] = [network, gaussian, uniform]
+    parts: list[Any] = [_Acting(network), gaussian, uniform]
     return TensorDictSequential(*parts)
 
 

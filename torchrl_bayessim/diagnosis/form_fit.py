@@ -200,7 +200,7 @@ def _reach(train: Objective, unit: Unit) -> Reach:
         for states, columns in zip((segments.qpos, segments.qvel), places, strict=True)
     )
     time = float(np.abs(segments.time).max())
-    return Reach(position, velocity, time, slides(robot, joint))
+    return Reach(position, velocity, time, all(slides(robot, j) for j in joints))
 
 
 def _moved(train: Objective, model: Model, shifts: Sequence[_Shift]) -> list[Point]:

@@ -86,7 +86,7 @@ class Evident:
         law: How they come about.
         point: The simulator in which they are likeliest.
         without: Deviance of the best explanation without losses.
-        segments: In which they are, of each split.
+        segments: Of each split, with the commands as they were sent, at the nominal fit.
     """
 
     unit: Unit

@@ -239,11 +239,14 @@ def _fewest(
 ) -> Model | None:
     """Return the best model, or one with a single new effect where more are a stopgap.
 
-    Or where that effect explains as much in another form, which others imitate.
+    Or where that effect explains as much in another form, which others imitate. Where none is
+    better, one that is if its law is bent.
     """
     singles = [m for m in models if len(_new_names(base, m)) == 1]
     if better is None:  # a law in a wrong form may fit some runs and predict no others
-        return next(iter(_in_other_forms(sets, base, singles, offered)), None)
+        bent = _in_other_forms(sets, base, singles, offered)
+        least = priced(sets[0], base, offered)
+        return next((m for m in bent if priced(sets[0], m, offered) < least), None)
     several, smaller = len(_new_names(base, better)) > 1, None
     if several:
         smaller = _chosen(base, singles)

@@ -40,7 +40,7 @@ _BEFORE = 8  # control steps that effects remember
 _MOST = 400  # segments
 _SLOWEST = 0.5  # cycles per log: slower ones are trends
 _FASTEST = 0.75  # cycles per segment, of which the mean is a third of the largest force
-_NUMBERS = np.arange(2.0, 25.0)  # cogs per turn; one is gravity's
+_FEWEST, _NUMBERS = 2.0, 25.0  # cogs per turn; one is gravity's
 _CLEAR = 0.1  # share of the force's variance that a sine or a step must explain
 _FINEST, _GRID = 0.02, 600  # of the largest step that is plausible; steps tried
 
@@ -76,12 +76,15 @@ def shaped(
         best = _sine(force[:, i], 2 * np.pi * time, frequencies)
         if best is not None:
             found.append(PeriodicDisturbance(frequency=best[0], phase=best[1]))
-        rates = _waves(positions) if slides(system.robot, joint) else _NUMBERS
-        best = _sine(force[:, i], positions[:, _STEPS // 2], rates)
-        if best is not None and best[0] * np.ptp(positions) < 2 * np.pi:
-            best = _sine(force[:, i], positions[:, _STEPS // 2], rates, offset=False)
+        slide = slides(system.robot, joint)
+        rates = _waves(positions) if slide else _numbers(positions)
+        middle = positions[:, _STEPS // 2]
+        best = _sine(force[:, i], middle, rates)
         if best is not None:
             found.append(Cogging(number=best[0], phase=best[1]))
+            if best[0] * np.ptp(positions) < 2 * np.pi:
+                best = _sine(force[:, i], middle, rates, offset=False)
+                found += [] if best is None else [Cogging(number=best[0], phase=best[1])]
         units += [u for u in units_of(found, system.robot) if u.where == push.where]
     for unit in units_of([ActionQuantization()], system.robot):
         joint, actuator = unit.joint(system.robot), unit.direction.index(1.0)
@@ -138,6 +141,12 @@ def _waves(positions: Array) -> Array:
     return np.arange(slowest, np.pi / within, 0.25 * slowest)[:_GRID]
 
 
+def _numbers(positions: Array) -> Array:
+    """Return numbers per turn of a hinge, as close as its way tells them apart, at most one."""
+    apart = min(1.0, 0.25 * np.pi / max(float(np.ptp(positions)), 1e-9))
+    return np.arange(_FEWEST, _NUMBERS, max(apart, (_NUMBERS - _FEWEST) / _GRID))
+
+
 def _rounding(force: Array, commands: Array, most: float) -> float | None:
     """Return the step to which commands ``(S, T)`` seem to be rounded, if one stands out."""
     target = _bounded(force)
@@ -163,16 +172,15 @@ def _sine(
         offset: Whether the force has a constant beside the sine, which other effects may make. Of
             a wave that is longer than the way, the mean over that is a part of the sine.
     """
-    target = _bounded(force)
+    whole, target = _clipped(force), _bounded(force)
     total = float((target**2).sum())
     best, choice = _CLEAR * total, None
-    mean = 0.0 if offset else float(_clipped(force).mean())
     for rate in rates:
         columns = np.stack([np.sin(rate * angle), np.cos(rate * angle)], 1)
         if offset:
             columns = np.c_[columns, np.ones_like(angle)]
-        solution, *_ = np.linalg.lstsq(columns, target + mean, rcond=None)
-        explained = total - float(((target + mean - columns @ solution) ** 2).sum())
+        solution, *_ = np.linalg.lstsq(columns, whole, rcond=None)
+        explained = total - float(((whole - columns @ solution) ** 2).sum())
         if explained > best:
             best = explained
             choice = float(rate), math.atan2(solution[1], solution[0])

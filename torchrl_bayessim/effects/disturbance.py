@@ -18,6 +18,7 @@ from .robot import Robot
 
 _MOVED = 0.05  # rad by which an angle is moved to see what that does, at its farthest
 _ANY = -math.inf, math.inf
+_STILL = 1e-3  # rad or m: what moves less says nothing of a wave's length
 _OVERTONES: Mapping[str, tuple[float, float, float]] = dict.fromkeys(
     ("sine2", "cosine2", "sine3", "cosine3"), (0.05, -1.0, 1.0)
 )
@@ -110,7 +111,7 @@ class Cogging(_Wave):
     Args:
         number: ``k``, periods per turn of a hinge, or per 2π m of a slide.
         phase: ``φ``, rad.
-        sine2: ``b₂``. A diagnosis fits these, with ``k`` and ``φ``.
+        sine2: ``b₂``. A diagnosis fits these, with ``k`` and ``φ``, also where they were given.
         cosine2: ``c₂``.
         sine3: ``b₃``.
         cosine3: ``c₃``.
@@ -126,13 +127,17 @@ class Cogging(_Wave):
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
         """Return all of its options.
 
-        Of a slide at least half a period lies within its way: what is longer is a spring. A hinge
-        has at least two per turn, as one is gravity's; behind a gear they need not be whole.
+        Of a slide at least half a period lies within twice its distance from zero: what is longer
+        is a spring. A hinge has at least two per turn, as one is gravity's; behind a gear they need
+        not be whole.
         """
-        way = 2 * max(reach.position, 1e-9)
-        least = math.pi / way if reach.slides else 2.0
-        number = 2 * _MOVED / way, least, math.inf
-        return {"number": number, "phase": (_MOVED, *_ANY), **_OVERTONES}
+        far = 2 * max(reach.position, _STILL)
+        least = min(math.pi / far if reach.slides else 2.0, self.number)
+        return {
+            "number": (2 * _MOVED / far, least, math.inf),
+            "phase": (_MOVED, *_ANY),
+            **_OVERTONES,
+        }
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the joints' names."""

@@ -94,8 +94,8 @@ class Effect(ABC):
             what shows is a period and ``s`` its square, so that fast ones are told apart too.
         nuisances: Options of `free` of which no value is the usual one: fitted like strengths, and
             what is not known of them widens the intervals of strengths in any case.
-        placed: Options of a wave, read off the data before it is offered: numbers that it has
-            beside its strength, and that it is priced for.
+        placed: Options of `free` that are read off the data before the effect is offered, such as
+            frequency and phase: numbers that it has beside its strength, and that it is priced for.
     """
 
     name: ClassVar[str]
@@ -147,6 +147,7 @@ class Effect(ABC):
 
         Returns:
             By the option's name, a change that shows a little, its least and its largest value.
+            What is neither in ``placed`` nor in ``nuisances`` bends the law from what was offered.
         """
         del reach
         return {}
