@@ -101,7 +101,7 @@ def test_the_analytic_correction_stays_at_the_known_posterior_round_after_round(
         GaussianPrior({"theta": (0.0, 1.0)}),
         torch.tensor([[0.3]]),
         rounds=3,
-        simulations=300,
+        simulations=600,
         correction="analytic",
         seed=seed,
         epochs=40,
