@@ -76,8 +76,7 @@ def shaped(
         best = _sine(force[:, i], 2 * np.pi * time, frequencies)
         if best is not None:
             found.append(PeriodicDisturbance(frequency=best[0], phase=best[1]))
-        slide = slides(system.robot, joint)
-        rates = _waves(positions) if slide else _numbers(positions)
+        rates = (_waves if slides(system.robot, joint) else _numbers)(positions)
         middle = positions[:, _STEPS // 2]
         best = _sine(force[:, i], middle, rates)
         if best is not None:
@@ -172,15 +171,15 @@ def _sine(
         offset: Whether the force has a constant beside the sine, which other effects may make. Of
             a wave that is longer than the way, the mean over that is a part of the sine.
     """
-    whole, target = _clipped(force), _bounded(force)
-    total = float((target**2).sum())
+    target = _clipped(force)
+    total = float(((target - target.mean()) ** 2).sum())
     best, choice = _CLEAR * total, None
     for rate in rates:
         columns = np.stack([np.sin(rate * angle), np.cos(rate * angle)], 1)
         if offset:
             columns = np.c_[columns, np.ones_like(angle)]
-        solution, *_ = np.linalg.lstsq(columns, whole, rcond=None)
-        explained = total - float(((whole - columns @ solution) ** 2).sum())
+        solution, *_ = np.linalg.lstsq(columns, target, rcond=None)
+        explained = total - float(((target - columns @ solution) ** 2).sum())
         if explained > best:
             best = explained
             choice = float(rate), math.atan2(solution[1], solution[0])
