@@ -403,15 +403,72 @@ def test_a_pair_is_as_visible_as_the_less_visible_of_its_causes(monkeypatch):
     found = []
 
     def spy(*args, **options):
-        found.append(detectability(*args, **options))
-        return found[-1]
+        found.append((detectability(*args, **options), options["known"] is not None))
+        return found[-1][0]
 
     detectability = cases.detectability
     monkeypatch.setattr(cases, "detectability", spy)
     plan = cases.Plan("T5", "arm", ("coulomb_friction", "sensor_drift"))
     case = cases.make(plan, np.random.default_rng(0))
-    assert len(found) == 2
-    assert case.detectability == min(found) < max(found)
+    assert [beside for _, beside in found] == [False, False, True, True]
+    values = [value for value, _ in found]
+    assert case.detectability == min(values) < max(values)
+
+
+def _moved(*names):
+    """Return a plant of the two links with causes, those causes, and a motion of it."""
+    from withheld import cases
+    from withheld.plant import Plant
+    from withheld.robots import ROBOTS, nominal_model
+
+    robot, rng = ROBOTS["two_links"], np.random.default_rng(4)
+    model = nominal_model(robot)
+    causes = [cases._cause(name, "same", model=model, robot=robot, rng=rng)[0] for name in names]
+    plant = lambda some: Plant(
+        nominal_model(robot), robot.control_dt, some, np.zeros(4), np.random.default_rng(0)
+    )
+    whole = plant(causes)
+    commands = np.random.default_rng(1).normal(size=(60, 2)).cumsum(0) / 10
+    motion = whole.run(np.full(2, 0.3), np.zeros(2), lambda k, _: commands[k], steps=60)
+    return plant, causes, whole, motion
+
+
+def test_a_robot_that_follows_its_own_motion_measures_the_same_again():
+    # each of these remembers something, which has to go on where the robot is put into a state
+    *_, whole, motion = _moved("action_lag", "sensor_lag", "sensor_bias", "backlash")
+    states = motion.clean - motion.sensed.sum(1)
+    again = whole.follow(states, motion.ctrl, range(6, 40, 20))
+    np.testing.assert_allclose(again, motion.clean, rtol=0, atol=1e-12)
+    assert motion.sensed[:, [0, 3]].max() == 0  # neither command nor force is measured
+    assert all(abs(motion.sensed[:, i]).max() > 0 for i in (1, 2))
+
+
+def test_a_cause_is_invisible_beside_another_where_it_does_nothing():
+    from withheld.detectability import beside, detectability
+    from withheld.robots import ROBOTS, nominal_model
+
+    model = nominal_model(ROBOTS["two_links"])
+    options = {
+        "substeps": round(ROBOTS["two_links"].control_dt / model.opt.timestep),
+        "noise": np.array([1e-3, 1e-3, 1e-2, 1e-2]), "measured": np.ones(4, dtype=bool),
+        "parameters": [],
+    }  # fmt: skip
+    plant, causes, _, motion = _moved("coulomb_friction")
+    # the other cause is none: all that is missing is known
+    alone = detectability(model, [motion], **options)
+    known = beside(plant(causes), [motion], 0)
+    assert detectability(model, [motion], **options, known=known) < 1e-6 * alone
+    # what a spring does no friction can imitate
+    plant, causes, _, motion = _moved("coulomb_friction", "parallel_spring")
+    known = beside(plant(causes[:1]), [motion], 0)
+    assert detectability(model, [motion], **options, known=known) > 100
+
+
+def test_nobody_knows_what_chance_would_have_done():
+    from withheld.detectability import beside
+
+    plant, causes, _, motion = _moved("packet_drop")
+    assert beside(plant(causes), [motion], 0) is None
 
 
 def test_a_sensor_of_velocities_has_velocities_logged_and_a_withheld_case_a_list():

@@ -18,7 +18,7 @@ from .causes_chance import CHANCE
 from .causes_foreign import FOREIGN
 from .causes_sensing import SENSING
 from .classes import without_class_of
-from .detectability import detectability
+from .detectability import beside, detectability
 from .excitation import KINDS, open_loop, proportional
 from .laws import Made, Site
 from .plant import Cause, Motion, Plant, Policy, Truth
@@ -71,8 +71,8 @@ class Case:
         real_noise: Those of the sensors.
         velocities: Whether velocities are logged.
         effects: Names that the diagnosis may consider; nothing for all.
-        detectability: See `detectability`; of several causes, the least that one of them has in
-            the same data without the others.
+        detectability: See `detectability`; of two causes, the least that one of them has, in the
+            same data without the other or beside it.
         excitation: How it was moved.
     """
 
@@ -130,16 +130,19 @@ def _make(plan: Plan, rng: np.random.Generator) -> Case:
     real, plant.noise = plant.noise, 0.0 * noise
     unseen = _motions(plant, robot, loops, count=3, steps=steps, rng=rng)
     measured = np.repeat([True, velocities], nv)
-    seen = [motions]
-    if len(made) > 1:  # each alone, in the same data
+    seen: list[tuple[list[Motion], list[Array] | None]] = [(motions, None)]
+    if len(made) > 1:
         lone = [plant_with([cause], deepcopy(before)) for cause, _ in made]
-        seen = [_motions(p, robot, loops, count=count, steps=steps, rng=p.rng) for p in lone]
+        seen = [(_motions(p, robot, loops, count=count, steps=steps, rng=p.rng), None)
+                for p in lone]  # fmt: skip
+        known = [beside(p, motions, i) for i, p in enumerate(lone)]
+        seen += [(motions, shown) for shown in known if shown is not None]
     visible = min(
         detectability(
             nominal, some, substeps=round(robot.control_dt / nominal.opt.timestep),
-            noise=real, measured=measured, parameters=list(priors),
+            noise=real, measured=measured, parameters=list(priors), known=shown,
         )
-        for some in seen
+        for some, shown in seen
     )  # fmt: skip
     if plan.control == "shuffled":
         motions = [replace(m, ctrl=motions[i - 1].ctrl) for i, m in enumerate(motions)]

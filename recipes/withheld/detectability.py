@@ -10,24 +10,31 @@ out::
 It is the non-centrality of the best test between the cause and none, in all trajectories together.
 About contacts the covariance by derivatives is too small: there ``C`` of a segment is as many times
 larger as draws of the noise, of measurements and initial state, exceed it without any cause.
+
+Of two causes, each has a ``lambda`` beside the other: ``r`` then is what the robot misses that has
+the other one only, put into the measured states as often, and what the other one does, ``g``, at
+another strength could account for is projected out, too.
 """
 
 from __future__ import annotations
 
-__all__ = ["detectability"]
+__all__ = ["beside", "detectability"]
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 
 import mujoco
 import numpy as np
 from mujoco import rollout
 from numpy.typing import NDArray
 
-from .plant import Motion
+from .plant import Motion, Plant
 from .robots import entry_value, write_entry
 
 Array = NDArray[np.float64]
 _DRAWS = 16  # of the noise
+_HORIZON = 20  # H
+_FIRST = 6  # row that is predicted from: before it causes have nothing to remember
 _UNKNOWN = 100.0  # 1/s, noise of a velocity that is not measured per noise of its position
 
 
@@ -39,7 +46,7 @@ def detectability(
     noise: Array,
     measured: Array,
     parameters: Sequence[str],
-    horizon: int = 20,
+    known: Sequence[Array] | None = None,
 ) -> float:
     """Return ``lambda``.
 
@@ -50,14 +57,17 @@ def detectability(
         noise: Standard deviations of the tangent coordinates, ``(2 nv,)``.
         measured: Which of them the diagnosis sees, boolean.
         parameters: Entries of the model that the diagnosis may refit.
-        horizon: Control steps predicted.
+        known: What another cause alone would show of each motion, in pieces, as `beside` gives.
     """
-    start, commands, after = [], [], []
-    for motion in motions:
-        for k in range(6, len(motion.clean) - horizon, horizon):
+    horizon = _HORIZON
+    start, commands, after, shown = [], [], [], []
+    for i, motion in enumerate(motions):
+        for k in _starts(len(motion.clean)):
             start.append(motion.clean[k])
             commands.append(motion.ctrl[k : k + horizon])
             after.append(motion.clean[k + 1 : k + horizon + 1])
+            if known is not None:
+                shown.append(known[i][k + 1 : k + horizon + 1])
     x, u, y = np.array(start), np.array(commands), np.array(after)
     width = len(noise)
 
@@ -81,8 +91,10 @@ def detectability(
 
     scale = np.repeat(_excess(predict, whiten, x, noise=(first_noise, noise[measured])), len(floor))
 
-    r = whiten(y[..., measured] - base) / scale
-    tangents = []
+    r, tangents = whiten(y[..., measured] - base) / scale, []
+    if shown:
+        other = whiten(np.array(shown)[..., measured] - base) / scale
+        r, tangents = r - other, [other]
     for entry in parameters:
         value = entry_value(model, entry)
         write_entry(model, entry, 1.01 * value)
@@ -92,6 +104,30 @@ def detectability(
         q, _ = np.linalg.qr(np.stack(tangents, 1))
         r = r - q @ (q.T @ r)
     return float(r @ r)
+
+
+def beside(plant: Plant, motions: Sequence[Motion], cause: int) -> list[Array] | None:
+    """Return what a robot with one cause shows of the motions of one with several.
+
+    Nothing if that cause is left to chance, of which nobody knows what it would have been.
+
+    Args:
+        plant: With that cause alone.
+        motions: Of the robot with all.
+        cause: The number of that cause there.
+    """
+    before = deepcopy(plant.rng.bit_generator.state)
+    shown = []
+    for motion in motions:
+        # as measured, but for what the cause itself adds: another sensor's error stays in it
+        states = motion.clean - motion.sensed[:, cause]
+        shown.append(plant.follow(states, motion.ctrl, _starts(len(states))))
+    return shown if plant.rng.bit_generator.state == before else None
+
+
+def _starts(rows: int) -> range:
+    """Return the rows from which so many are predicted."""
+    return range(_FIRST, rows - _HORIZON, _HORIZON)
 
 
 def _excess(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 __all__ = ["Cause", "Motion", "Plant", "Truth"]
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -58,6 +58,7 @@ class Motion:
         ctrl: Logged commands, ``(T, nu)``.
         acts: How much each cause changes, the largest in every control step, ``(T, causes)``:
             of commands, of forces, of what is measured; 0 throughout for a change of the model.
+        sensed: What each cause adds to what is measured, ``(T, causes, 2 nv)``.
     """
 
     clean: Array
@@ -65,6 +66,7 @@ class Motion:
     qpos: Array
     ctrl: Array
     acts: Array
+    sensed: Array
 
 
 @dataclass
@@ -88,6 +90,7 @@ class Plant:
     commands: list[Array] = field(init=False, default_factory=list)
     states: list[Array] = field(init=False, default_factory=list)
     acts: list[Array] = field(init=False, default_factory=list)
+    sensed: list[Array] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
         for cause in self.causes:
@@ -122,13 +125,9 @@ class Plant:
         Raises:
             FloatingPointError: The simulation diverged.
         """
-        self.commands, self.states, self.acts = [], [], []
-        for cause in self.causes:
-            cause.memory.clear()
-        self._reset(q, v)
+        self._begin(q, v)
         clean, measured = [], []
         for k in range(steps):
-            self.acts.append(np.zeros(len(self.causes)))
             clean.append(self._read())
             measured.append(clean[-1] + self.noise * self.rng.standard_normal(len(self.noise)))
             self.commands.append(np.asarray(policy(k, measured[-1]), dtype=np.float64))
@@ -138,11 +137,50 @@ class Plant:
         if not np.isfinite(rows).all() or np.abs(rows).max() > 1e3:
             raise FloatingPointError("the simulation diverged")
         acts = np.array(self.acts).reshape(steps, len(self.causes))
-        return Motion(rows, np.array(measured), rows[:, :nv], np.array(self.commands), acts)
+        sensed = np.array(self.sensed).reshape(steps, len(self.causes), 2 * nv)
+        commands = np.array(self.commands)
+        return Motion(rows, np.array(measured), rows[:, :nv], commands, acts, sensed)
+
+    def follow(self, states: Array, commands: Array, at: Collection[int]) -> Array:
+        """Return what is measured along another robot's motion, in pieces.
+
+        What causes remember goes on from piece to piece; a piece ends with the row at which the
+        next one begins.
+
+        Args:
+            states: Of the other robot, ``(T, 2 nv)``.
+            commands: That it was given, ``(T, nu)``.
+            at: Control steps at which this robot is put into the other's state, beside the first.
+
+        Returns:
+            Shape ``(T, 2 nv)``.
+        """
+        nv = self.model.nv
+        self._begin(states[0, :nv], states[0, nv:])
+        rows = []
+        for k, command in enumerate(commands):
+            rows.append(self._read())
+            if k in at:
+                self._place(states[k, :nv], states[k, nv:])
+            self.commands.append(command)
+            for _ in range(self.substeps):
+                self._step()
+        return np.array(rows)
+
+    def _begin(self, q: Array, v: Array) -> None:
+        """Start a trajectory: nothing was commanded, and no cause remembers anything."""
+        self.commands, self.states, self.acts, self.sensed = [], [], [], []
+        for cause in self.causes:
+            cause.memory.clear()
+        self._reset(q, v)
 
     def _reset(self, q: Array, v: Array) -> None:
         """Put the robot into a state, at time zero."""
         mujoco.mj_resetData(self.model, self.data)
+        self._place(q, v)
+
+    def _place(self, q: Array, v: Array) -> None:
+        """Put the robot into a state, now."""
         self.data.qpos[:], self.data.qvel[:] = q, v
         mujoco.mj_forward(self.model, self.data)
 
@@ -154,9 +192,12 @@ class Plant:
     def _read(self) -> Array:
         y = np.concatenate([self.q, self.v])
         self.states.append(y)
+        self.acts.append(np.zeros(len(self.causes)))
+        self.sensed.append(np.zeros((len(self.causes), len(y))))
         for i, cause in enumerate(self.causes):
             seen = cause.sense(y, self)
             self._acted(i, seen - y)
+            self.sensed[-1][i] = seen - y
             y = seen
         return y
 
