@@ -1,9 +1,13 @@
 """Which effects count as not told apart, on models with known misfits."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from torchrl_bayessim.diagnosis.confusion import confusion_set, rivals
+from torchrl_bayessim.diagnosis import confusion
+from torchrl_bayessim.diagnosis.alternatives import exchanged, leaves_less_to_do
+from torchrl_bayessim.diagnosis.confusion import confusion_set, rivals, settled
 from torchrl_bayessim.diagnosis.model import Model
 from torchrl_bayessim.diagnosis.objective import Point, Unit
 from torchrl_bayessim.diagnosis.refit import Fit
@@ -80,3 +84,45 @@ def test_a_part_of_the_best_model_is_no_rival_where_something_is_left():
     best = model(1.0, "action_delay")
     found = selection(best, model(1.01, "action_delay"), p_values=(1e-9, 0.001))
     assert confusion_set(found, "action_delay") == ("action_delay",)
+
+
+def pair(square, **strengths):
+    """Return a model of effects at given strengths."""
+    bare = model(square, *strengths)
+    values = dict(zip(bare.units, strengths.values(), strict=True))
+    return replace(bare, fit=replace(bare.fit, point=Point(bare.fit.point.z, values)))
+
+
+ONE_WAY = {"directional_friction": 0.34, "action_bias": 0.14}
+BOTH_WAYS = {"coulomb_friction": 0.17, "action_bias": -0.03}
+
+
+def test_friction_one_way_and_half_of_it_as_a_push_is_friction_both_ways(monkeypatch):
+    best, other = pair(1.0, **ONE_WAY), pair(1.001, **BOTH_WAYS)
+    assert leaves_less_to_do(best, other)
+    assert not leaves_less_to_do(other, best)
+    assert exchanged(best, {"directional_friction": (other,)}) is other
+    monkeypatch.setattr(confusion, "parts", lambda *_: [])
+    # also where it explains a little less, as long as that may be chance
+    for one, name in ((best, "directional_friction"), (other, "coulomb_friction")):
+        found = replace(
+            selection(one), alternatives={name: tuple(m for m in (best, other) if m is not one)}
+        )
+        sets = dict.fromkeys(("train", "validation"))
+        assert settled(found, name, sets).best is other
+
+
+@pytest.mark.parametrize(
+    "instead",
+    [
+        {"coulomb_friction": 0.17, "action_bias": 0.1},  # as much to make up for
+        {"armature": 0.17, "action_bias": 0.03},  # of another kind
+        {"coulomb_friction": 0.17},  # which had nothing to do
+    ],
+)
+def test_other_equals_stay_behind_what_explains_a_little_more(instead):
+    assert not leaves_less_to_do(pair(1.0, **ONE_WAY), pair(1.001, **instead))
+
+
+def test_what_is_worse_is_no_equal_however_little_it_leaves_to_do():
+    assert not leaves_less_to_do(pair(1.0, **ONE_WAY), pair(2.0, **BOTH_WAYS))

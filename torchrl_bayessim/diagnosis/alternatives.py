@@ -6,7 +6,7 @@ would do as well beside the effects that were found since, is fitted here.
 
 from __future__ import annotations
 
-__all__ = ["alternatives", "exchanged", "kind"]
+__all__ = ["alternatives", "exchanged", "kind", "leaves_less_to_do"]
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -25,6 +25,7 @@ from .screening import Screen
 _ALIKE = 4  # models with an effect of the same group in its place
 _RIVALS = 6  # models with another effect in the place of one
 _MORE, _LITTLE = 5.0, 0.05  # mean squared innovation; share of friction's range, to start from
+_LESS = 0.5  # times: of what an effect did that made up for another
 _ALONG = (0.25, 0.5)  # of the range of friction in contacts, to start from
 
 
@@ -178,7 +179,10 @@ def _raced(sets: tuple[Objective, Objective], starts: Sequence[Point], best: Mod
 
 
 def exchanged(best: Model, others: Mapping[str, Sequence[Model]]) -> Model:
-    """Return the best of a model and its alternatives, itself unless chance is unlikely."""
+    """Return the best of a model and its alternatives, itself unless chance is unlikely.
+
+    Or unless one that is as good leaves less for the others to do (`leaves_less_to_do`).
+    """
     every = [model for models in others.values() for model in models]
     candidates = [
         m for m in every if len(m.units) <= len(best.units) or gain(best, m) > needed(best, m)
@@ -187,4 +191,22 @@ def exchanged(best: Model, others: Mapping[str, Sequence[Model]]) -> Model:
     better_by = criterion(best, best.dispersion()) - criterion(first, best.dispersion())
     if len(first.units) > len(best.units) and as_good(first, best):
         return best  # something is wrong with both, and more strengths mend more of it
-    return first if better_by > LIKELY else best
+    if better_by > LIKELY:
+        return first
+    return next((m for m in every if leaves_less_to_do(best, m)), best)
+
+
+def leaves_less_to_do(best: Model, other: Model) -> bool:
+    """Return whether the others have little to do beside another effect of a kind that is as good.
+
+    Friction in one direction and a push that is half of it against the other are friction in both.
+    """
+    mine, others = best.fit.point.strengths, other.fit.point.strengths
+    shared = [unit for unit in mine if unit in others]
+    instead = {u.effect.group for u in others if u not in mine}
+    alike = instead == {u.effect.group for u in mine if u not in others} and len(instead) == 1
+    if not shared or not alike or len(others) > len(mine):
+        return False
+    before, after = (np.array([abs(s[u] / u.high) for u in shared]) for s in (mine, others))
+    made_up_for = (after < _LESS * before).any() and after.sum() < before.sum()
+    return bool(made_up_for) and as_good(best, other)

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from ..effects.effect import Effect
 from ..effects.transmission import ServoDeadBand
-from .alternatives import kind
+from .alternatives import kind, leaves_less_to_do
 from .elimination import parts, without_idle
 from .model import Model, as_good
 from .objective import Objective
@@ -145,13 +145,15 @@ def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> S
 
     Of training and validation: test runs choose nothing. Of those that explain the same to the
     last, such as late commands and late sensors, it is the one with fewer faults of sensors: it
-    needs no names of channels to be put on a simulator.
+    needs no names of channels to be put on a simulator. And of equals that leave the other effects
+    more and less to make up for, the one that leaves less.
     """
     equals = [selection.best, *rivals(selection, name)]
     deviances = {model: float(model.deviances().sum()) for model in equals}
     least = min(deviances.values())
     same = [model for model in equals if deviances[model] - least < _SAME]
     first = min(same, key=lambda model: (_sensing(model), deviances[model]))
+    first = next((model for model in equals if leaves_less_to_do(first, model)), first)
     if first is selection.best:
         return selection
     chosen, first = first, without_idle(sets["train"], sets["validation"], first)
