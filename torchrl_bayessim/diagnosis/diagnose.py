@@ -35,7 +35,7 @@ from .lost_commands import beside_lost_commands
 from .modes import MODES
 from .objective import Point, Unit, pushes_of, units_of
 from .onsets import with_onsets
-from .preparation import Prepared, prepare
+from .preparation import Prepared, prepare, with_less_noise
 from .report import Report
 from .scatter import Scatter, Sent, gap_with_holds
 from .selection import Selection, select
@@ -113,8 +113,7 @@ def diagnose(
             system, bridges, units, generator=generator, mode=told, horizon=horizon
         ).alarmed(*slow)
         search = partial(_searched, system, units=units, generator=generator, progress=progress)
-        alarms = prepared.alarms
-        prepared, selection = search(prepared)
+        alarms, prepared, selection = _beside_noise(search, prepared, generator)
         progress("looking for scatter")
         random, found = of_chance(every), losses(prepared, selection, every)
         sent, recorded = None, 1.0
@@ -147,6 +146,24 @@ def diagnose(
         )
 
 
+def _beside_noise(
+    search: Callable[..., tuple[Prepared, Selection]],
+    prepared: Prepared,
+    generator: np.random.Generator,
+) -> tuple[tuple[str, ...], Prepared, Selection]:
+    """Search for effects that last, and on where they show that there is less noise.
+
+    Returns:
+        Alarms before the last search, what it started from, and what it found.
+    """
+    alarms = prepared.alarms
+    prepared, selection = search(prepared)
+    quieter = with_less_noise(prepared, selection.best.fit.point, generator=generator)
+    if quieter is None:
+        return alarms, prepared, selection
+    return quieter.alarms, *search(quieter, known=selection)
+
+
 def _searched(
     system: System,
     prepared: Prepared,
@@ -154,16 +171,21 @@ def _searched(
     units: Sequence[Unit],
     generator: np.random.Generator,
     progress: Callable[[str], None],
+    known: Selection | None = None,
 ) -> tuple[Prepared, Selection]:
     """Search for effects that last; an alarm where sensors that are late had to be left out."""
     shapes = partial(_shapes, system, prepared, units)
-    units = with_shapes(units, shapes(prepared.nominal.point))
-    units = with_onsets(prepared.sets["train"], prepared.nominal.point, units)
+    if known is None:
+        units = with_shapes(units, shapes(prepared.nominal.point))
+        units = with_onsets(prepared.sets["train"], prepared.nominal.point, units)
+    else:
+        units = list(dict.fromkeys(known.screens[0].units))
     search = partial(
         select,
         prepared.sets["train"],
         prepared.sets["validation"],
         prepared.nominal,
+        known=known,
         shapes=shapes,
         alpha=_ALPHA,
         generator=generator,

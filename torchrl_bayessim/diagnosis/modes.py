@@ -19,7 +19,7 @@ from ..inference.priors import Prior
 from ..logs.log import Log
 from .horizon import chosen_horizon
 from .noise import assumed_noise, measured_noise
-from .objective import Objective, Unit, origin, parameters_at
+from .objective import Objective, Point, Unit, origin, parameters_at
 from .prediction import Predictor
 from .segments import Segments, cut, cut_for_fits
 from .synthetic_likelihood import synthetic_objective
@@ -50,7 +50,13 @@ class Mode:
     alarms: tuple[str, ...] = ()
 
     def noise(
-        self, predictor: Predictor, logs: Sequence[Log], *, history: int, alarms: list[str]
+        self,
+        predictor: Predictor,
+        logs: Sequence[Log],
+        *,
+        history: int,
+        alarms: list[str],
+        beside: Point | None = None,
     ) -> tuple[Array, str]:
         """Return the standard deviation of each channel's noise, and where it comes from.
 
@@ -59,8 +65,9 @@ class Mode:
             logs: For training.
             history: Rows before a segment that effects look back at.
             alarms: To which is added what the reader must know.
+            beside: The simulator that leaves noise; default none of the effects.
         """
-        return measured_noise(predictor, logs, history=history, alarms=alarms)
+        return measured_noise(predictor, logs, history=history, alarms=alarms, beside=beside)
 
     def horizon(
         self,
@@ -170,6 +177,7 @@ class Summaries(Mode):
         *,
         history: int,  # noqa: ARG002
         alarms: list[str],  # noqa: ARG002
+        beside: Point | None = None,  # noqa: ARG002
     ) -> tuple[Array, str]:
         """Return what is known without predictions."""
         noise = assumed_noise(predictor, logs)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["assumed_noise", "measured_noise"]
+__all__ = ["UNCERTAIN", "assumed_noise", "measured_noise"]
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from ..effects.robot import Robot
 from ..logs.log import Log
-from .objective import Objective, Point, origin, parameters_at, pushes_of
+from .objective import Objective, Point, Unit, origin, parameters_at, pushes_of
 from .prediction import Predictor
 from .refit import refit
 from .segments import Segments, cut
 from .whitening import ENOUGH, innovation_noise, noise_from_differences, whitening
 
 Array = NDArray[np.float64]
+UNCERTAIN = "noise floor uncertain"  # how that alarm begins
 _ROUNDS = 8  # third differences of fast motion start a hundred times too high
 _AT_ONCE = 5.0  # the most that a round trusts: too large a noise hides how far it is too large
 _SETTLED = 0.1  # logarithm of a factor that is not worth another round
@@ -61,20 +62,33 @@ def assumed_noise(predictor: Predictor, logs: Sequence[Log]) -> Array:
 
 
 def measured_noise(
-    predictor: Predictor, logs: Sequence[Log], *, history: int, alarms: list[str]
+    predictor: Predictor,
+    logs: Sequence[Log],
+    *,
+    history: int,
+    alarms: list[str],
+    beside: Point | None = None,
 ) -> tuple[Array, str]:
-    """Return each channel's noise: the differences of innovations, checked by the sensor's spec."""
+    """Return each channel's noise: the differences of innovations, checked by the sensor's spec.
+
+    Args:
+        predictor: Simulates.
+        logs: For training.
+        history: Rows before a segment that effects look back at.
+        alarms: To which is added what the reader must know.
+        beside: The simulator that leaves noise; default none of the effects.
+    """
     system, known = predictor.system, _Known.of(predictor, logs)
     noise = known.assumed
     pieces = _pieces(logs, history=history)
     pushes = pushes_of(system.robot)
-    z, estimate = origin(system.prior), noise
+    at, estimate = beside or Point(origin(system.prior)), noise
     for _ in range(_ROUNDS):
-        white = whitening(predictor, pieces, parameters_at(system.prior, z), noise)
+        white = whitening(predictor, pieces, parameters_at(system.prior, at.z), noise)
         objective = Objective(predictor, system.prior, pieces, white)
-        fit = refit(objective, [Point(z)], iterations=4)[0]
-        z = fit.point.z
-        points = [Point(z, {unit: 0.1 * unit.high}) for unit in pushes]
+        fit = refit(objective, [at], iterations=4)[0]
+        at = fit.point
+        points = [_pushed(at, unit) for unit in pushes]
         pushed = objective(points) if points else np.zeros((0, *fit.innovations.shape))
         factor = innovation_noise(fit.innovations, pushed - fit.innovations, len(pieces.checked))
         noise = np.maximum(noise * np.clip(factor, 1 / _AT_ONCE, _AT_ONCE), known.tiny)
@@ -87,8 +101,15 @@ def measured_noise(
         if spec > 0 and not 0.7 < estimate / spec < 1.4
     ]
     if apart:
-        alarms.append("noise floor uncertain, estimated against specified: " + ", ".join(apart))
-    return noise, "differences of innovations"
+        alarms.append(UNCERTAIN + ", estimated against specified: " + ", ".join(apart))
+    source = "differences of innovations"
+    return noise, source if beside is None else f"{source} beside the effects found first"
+
+
+def _pushed(point: Point, push: Unit) -> Point:
+    """Return a point with a tenth of the largest force at a joint beside what it has there."""
+    force = point.strengths.get(push, 0.0) + 0.1 * push.high
+    return Point(point.z, {**point.strengths, push: force})
 
 
 def _pieces(logs: Sequence[Log], *, history: int) -> Segments:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["Prepared", "prepare", "with_other_commands"]
+__all__ = ["Prepared", "prepare", "with_less_noise", "with_other_commands"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from ..logs.system import System
 from .contacts import likelier, one_sided, settled
 from .hidden import hidden_joints
 from .modes import Mode, Trajectories, shortest
-from .noise import assumed_noise
+from .noise import UNCERTAIN, assumed_noise
 from .objective import Objective, Point, Unit, origin, parameters_at
 from .prediction import Predictor
 from .refit import Fit, refit, with_width
@@ -33,6 +33,7 @@ _FEWEST = 12  # rows of a run
 _STEPS = 20  # over which a joint that nobody measured would be seen
 _ROUNDS = 3  # in which what nobody measured and the parameters are fitted in turn
 _MANY = 60  # segments on which they are
+_QUIETER = 0.87  # times the noise: a quarter of its variance was the missing effect
 _FEW = 8  # segments on which the parameters are fitted first
 
 
@@ -158,6 +159,34 @@ def with_other_commands(
     alarms = tuple(dict.fromkeys(alarms))
     started = _Started(predictor, mode, history, prepared.horizon, noise, source, alarms)
     return started.fitted(parts, generator)
+
+
+def with_less_noise(
+    prepared: Prepared, found: Point, *, generator: np.random.Generator
+) -> Prepared | None:
+    """Return the same with the noise that is left beside effects, if it is less somewhere.
+
+    What a missing effect does within a few steps looks like noise, and hides what else is missing.
+
+    Args:
+        prepared: With the noise beside the parameters alone.
+        found: The simulator with the effects that were found.
+        generator: As in `prepare`.
+    """
+    if not found.strengths or type(prepared.mode) is not Mode:
+        return None
+    predictor, history = prepared.predictor, prepared.sets["train"].segments.history
+    alarms = [alarm for alarm in prepared.alarms if not alarm.startswith(UNCERTAIN)]
+    noise, source = prepared.mode.noise(
+        predictor, prepared.logs["train"], history=history, alarms=alarms, beside=found
+    )
+    if (noise > _QUIETER * prepared.noise).all():
+        return None
+    noise = np.minimum(noise, prepared.noise)
+    started = _Started(
+        predictor, prepared.mode, history, prepared.horizon, noise, source, tuple(alarms)
+    )
+    return started.fitted(prepared.logs, generator)
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,6 +36,7 @@ from .shapes import with_shapes
 
 _MOST = 4  # effects in one explanation
 _UNSEEN = 1.0  # a deviance that no test can detect
+_AGAIN = 3  # steps of fits whose noise was another
 _FORMS = 3  # effects that are tried in other forms in one round
 _EXCHANGES = 3  # of effects for others in their places
 _EQUAL = 0.1  # of the deviance
@@ -68,6 +69,7 @@ def select(
     nominal: Fit,
     units: Sequence[Unit],
     *,
+    known: Selection | None = None,
     shapes: Callable[[Point], Sequence[Unit]] = lambda _: (),
     alpha: float = 0.01,
     generator: np.random.Generator,
@@ -80,6 +82,7 @@ def select(
         validation: Where they are judged.
         nominal: The fit of the parameters alone.
         units: The effects to consider, at each of their targets.
+        known: What was found before, with another noise: the search goes on from there.
         shapes: Returns those among them that have a frequency or a step, as they are seen beside
             what is in the model already.
         alpha: Level of the test that anything is missing, in every round.
@@ -103,6 +106,11 @@ def select(
         if enough or (p_values[-1] > alpha and not bent(best.fit)):
             break
         progress("fitting explanations")
+        if known is not None and not best.units:
+            models = _anew(train, validation, known)
+            best, tried = models[0], [start, *models]
+            units = _with_forms(units, best)
+            continue
         models = judged(train, validation, explanations(train, now))
         tried += models
         better = _chosen(best, models)
@@ -124,6 +132,13 @@ def select(
         train, validation, needs, units=units, tried=tried, first=screens[0], progress=progress
     )
     return Selection(start, best, tuple(screens), tuple(p_values), tuple(tried), others)
+
+
+def _anew(train: Objective, validation: Objective, known: Selection) -> list[Model]:
+    """Return the best model that was found, and the others that were tried, fitted again."""
+    best = known.best.fit.point
+    others = [m.fit.point for m in known.tried if m.units and m is not known.best]
+    return judged(train, validation, refit(train, [best, *others], iterations=_AGAIN))
 
 
 def _settled(
