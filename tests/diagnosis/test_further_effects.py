@@ -1,10 +1,12 @@
 """What makes a further effect more than a stopgap."""
 
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import pytest
 from plain_models import A, C, Unit, plain
 
+from torchrl_bayessim.diagnosis import further_effects
 from torchrl_bayessim.diagnosis.further_effects import identified
 
 
@@ -106,3 +108,72 @@ def test_two_effects_at_once_take_half_of_what_is_left_each(left, added):
     start, base = plain([], 4e6), plain([A], 1e6)
     better = plain([A, C, Unit("magnets")], left)
     assert identified(start, base, better, [better]) == added
+
+
+def screened(ratios):
+    """Return what a screen says that no law near the base could have, and whom it was asked of."""
+    asked = []
+
+    def beside(near):
+        asked.extend(near)
+        return {unit: ratio for unit, ratio in ratios.items() if unit not in near}
+
+    return SimpleNamespace(units=tuple(ratios), beside=beside), asked
+
+
+def at(name, where, group=None, *, channel="body"):
+    """Return a unit at one of two joints, a sensor's or a force's."""
+    joint = {"knee": 0, "hip": 1}[where]
+    acts = SimpleNamespace(
+        group=group or name, placed=(), channel=channel, joint=lambda robot, target: joint
+    )
+    return Placed(name, where, acts)
+
+
+class Placed(NamedTuple):
+    name: str
+    where: str
+    effect: SimpleNamespace
+    direction: tuple[float, ...] = (1.0,)
+    high: float = 1.0
+
+    def __hash__(self):
+        return hash((self.name, self.where))
+
+    def __eq__(self, other):
+        return (self.name, self.where) == (other.name, other.where)
+
+
+FRICTION, SPRING = at("friction", "knee"), at("spring", "knee")
+SENSOR = at("sensor_gain", "hip", "scale", channel="sensing")
+
+
+@pytest.mark.parametrize(
+    ("mine", "other", "added"),
+    [(400.0, 230.0, True), (400.0, 300.0, False), (90.0, 0.0, False)],
+    ids=["plain", "a rival is near", "faint"],
+)
+def test_what_no_law_at_the_same_joint_could_be_is_an_effect_elsewhere(mine, other, added):
+    """Two thirds of what the base leaves, and nothing of the gap."""
+    start, base = plain([], 1e5), plain([FRICTION], 590.0)
+    better = plain([FRICTION, SENSOR], 445.0)
+    seen, asked = screened({SENSOR: mine, SPRING: 900.0, at("gain", "hip"): other})
+    rival = plain([FRICTION, at("gain", "hip")], 520.0, flipped=True)
+    given = start, base, better, [better, rival]
+    assert not identified(*given)
+    assert identified(*given, seen=seen, robot="robot") == added
+    assert asked == [SPRING]
+
+
+def test_what_is_at_the_same_joint_may_be_the_form_of_its_law():
+    start, base = plain([], 1e5), plain([FRICTION], 590.0)
+    better = plain([FRICTION, SPRING], 445.0)
+    seen, _ = screened({SENSOR: 0.0, SPRING: 900.0})
+    rival = plain([FRICTION, SENSOR], 520.0, flipped=True)
+    assert not identified(start, base, better, [better, rival], seen=seen, robot="robot")
+
+
+def test_a_gain_that_other_runs_do_not_show_is_no_effect_elsewhere():
+    base, better = plain([FRICTION], 590.0), plain([FRICTION, SENSOR], 540.0)
+    seen, _ = screened({SENSOR: 400.0})
+    assert not further_effects._elsewhere(base, better, seen, "robot")

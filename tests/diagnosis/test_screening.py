@@ -7,7 +7,7 @@ from test_diagnose import logs, run, system
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.objective import units_of
-from torchrl_bayessim.diagnosis.screening import _levels, crossing
+from torchrl_bayessim.diagnosis.screening import Screen, _levels, crossing
 from torchrl_bayessim.effects.catalogue import effect
 
 
@@ -52,3 +52,34 @@ def test_limits_are_compared_at_more_strengths_than_what_grows_steadily():
         for name in ("torque_speed_limit", "saturation", "coulomb_friction")
     }
     assert counts["torque_speed_limit"] == counts["saturation"] > counts["coulomb_friction"] == 2
+
+
+def drawn(columns, left, units):
+    """Return a screen of signatures ``(M, G)`` of what is left ``(M,)``."""
+    directions = columns / np.linalg.norm(columns, axis=0)
+    size = columns.shape[1]
+    return Screen(
+        units=units, strengths=np.ones(size), norms=np.linalg.norm(columns, axis=0),
+        sizes=np.ones(size), scores=directions.T @ left, correlation=directions.T @ directions,
+        swallowed=np.zeros(size), residual=float(left @ left), effective=len(left),
+        changes=(), growth=np.ones(size),
+    )  # fmt: skip
+
+
+def test_what_others_could_have_explained_is_not_counted():
+    """The likelihood ratio is the squared norm that least squares gain beside the others."""
+    columns = np.random.default_rng(0).normal([1.0, 1.0, 0.0], size=(200, 3))
+    left = columns @ [2.0, 0.5, 1.0]
+    found = drawn(columns, left, ("a", "b", "c")).beside({"a"})
+    assert found.keys() == {"b", "c"}
+    for i, name in ((1, "b"), (2, "c")):
+        squares = [np.linalg.lstsq(columns[:, some], left)[1][0] for some in ([0], [0, i])]
+        assert found[name] == pytest.approx(squares[0] - squares[1])
+
+
+def test_what_others_explain_wholly_is_left_out():
+    columns = np.random.default_rng(1).normal(size=(200, 2))
+    columns = np.c_[columns, columns @ [1.0, -1.0]]
+    assert not drawn(columns, columns[:, 2], ("a", "b", "c")).beside({"a", "b"})
+    # and what explains the opposite explains nothing
+    assert drawn(columns, -columns[:, 0], ("a", "b", "c")).beside({"b"})["a"] == 0.0

@@ -30,7 +30,7 @@ from .assembly import assemble
 from .chance import chances, detectable, of_chance, unseen
 from .holds import bridged
 from .late_sensors import LATE, free_riders, without_free_riders
-from .losses import losses
+from .losses import Suspects, losses
 from .lost_commands import beside_lost_commands
 from .modes import MODES
 from .objective import Point, Unit, pushes_of, units_of
@@ -45,6 +45,7 @@ _ALPHA = 0.01
 _TOO_SHORT = (
     "sensors that are late were left out: over {} control steps they show what was measured before"
 )
+_NEARLY = 2.0  # mean squared innovation of what seems to leave noise alone
 _JITTER = 0.05  # of the control step; times since 1970 are rounded
 
 
@@ -115,17 +116,20 @@ def diagnose(
         search = partial(_searched, system, units=units, generator=generator, progress=progress)
         alarms, prepared, selection = _beside_noise(search, prepared, generator)
         progress("looking for scatter")
-        random, found = of_chance(every), losses(prepared, selection, every)
+        random, suspects = of_chance(every), Suspects.of(prepared, selection, every)
+        found = losses(prepared, selection, suspects) if suspects else []
         sent, recorded = None, 1.0
         if holds:
             recorded = gap_with_holds(prepared, logs, selection)
-        elif beside := beside_lost_commands(
-            replace(prepared, alarms=alarms),
-            selection,
-            found,
-            units=every,
-            search=search,
-            generator=generator,
+        elif suspects and (
+            beside := beside_lost_commands(
+                replace(prepared, alarms=alarms),
+                selection,
+                found,
+                suspects=suspects,
+                search=search,
+                generator=generator,
+            )
         ):
             selection, found = beside.selection, [beside.chance]
             sent = Sent.along(beside.prepared, beside.sent, selection)
@@ -151,17 +155,18 @@ def _beside_noise(
     prepared: Prepared,
     generator: np.random.Generator,
 ) -> tuple[tuple[str, ...], Prepared, Selection]:
-    """Search for effects that last, and on where they show that there is less noise.
+    """Search for effects that last, and on where they leave noise alone, and less than was thought.
 
     Returns:
         Alarms before the last search, what it started from, and what it found.
     """
     alarms = prepared.alarms
     prepared, selection = search(prepared)
-    quieter = with_less_noise(prepared, selection.best.fit.point, generator=generator)
-    if quieter is None:
-        return alarms, prepared, selection
-    return quieter.alarms, *search(quieter, known=selection)
+    if selection.best.mean_square < _NEARLY:
+        quieter = with_less_noise(prepared, selection.best.fit.point, generator=generator)
+        if quieter is not None:
+            return quieter.alarms, *search(quieter, known=selection)
+    return alarms, prepared, selection
 
 
 def _searched(

@@ -16,9 +16,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..effects.action import ActionDelay
+from ..effects.robot import Robot
 from ..effects.sensors import SensorDelay
 from .model import LIKELY, Model, as_good, gain
 from .objective import Unit
+from .screening import Screen
 
 _SHARE = 0.1  # of the gap: what an effect that could be another must remove to be kept
 _REST = 0.5  # of what the base leaves: what any further effect must remove, each of two at once
@@ -29,6 +31,8 @@ _VISIBLE = 1.2  # mean squared innovation that shows however small a share of th
 _DELAYS = ActionDelay.name, SensorDelay.name
 _WRONG = 1.5  # mean squared innovation of a base that something is missing from
 _SURELY, _NOTHING = 50.0, 0.2  # gain, and share of what the base leaves: it was just this
+# likelihood ratio of what is plain elsewhere, and times that of what another kind has there
+_PLAIN, _FAR = 100.0, 1.5
 _DIFFERENT = 0.1  # of the change that an effect makes: what another makes differently
 
 
@@ -39,6 +43,8 @@ def identified(
     models: Sequence[Model],
     *,
     timestep: float = math.inf,
+    seen: Screen | None = None,
+    robot: Robot | None = None,
 ) -> bool:
     """Return whether what is added to a base with effects is more than a stopgap.
 
@@ -48,11 +54,22 @@ def identified(
         better: With further ones.
         models: All that were tried on the base.
         timestep: Of the simulator, s: what is later than that no integrator is.
+        seen: The base, compared with all units.
+        robot: Where those act.
     """
     if not base.units:
         return True
     if nothing_left(start, base):
         return False
+    if _matters(start, base, better, models, timestep=timestep):
+        return True
+    return seen is not None and robot is not None and _elsewhere(base, better, seen, robot)
+
+
+def _matters(
+    start: Model, base: Model, better: Model, models: Sequence[Model], *, timestep: float
+) -> bool:
+    """Return whether what is added matters, to the gap or to what the base leaves."""
     alone, before, after = (m.mean_square for m in (start, base, better))
     removed = (before - after) / max(before - 1.0, 1e-9)
     # a third one mends the forms of two others more easily, and two at once more than one
@@ -76,6 +93,32 @@ def identified(
         if not second or not (just_this or (lone and removed > _REST)):
             return False
     return (before > _WRONG or just_this) and not _rivalled(base, better, models)
+
+
+def _elsewhere(base: Model, better: Model, seen: Screen, robot: Robot) -> bool:
+    """Return whether one effect is added that no other law at the places of the base could be.
+
+    Whatever is wrong with the form of a law is a force of its own joint, or an error of its own
+    sensor. What those together cannot explain, and one effect elsewhere does far better than any of
+    another kind, is that effect, however little of the gap it is.
+    """
+    added = [unit for unit in better.units if unit not in base.units]
+    if len({unit.name for unit in added}) != 1 or gain(base, better) < _SURELY:
+        return False
+    places = {place for unit in base.units for place in _places(unit, robot)}
+    near = {unit for unit in seen.units if _places(unit, robot) <= places}
+    told = seen.beside(near)
+    mine = max((told.get(unit, 0.0) for unit in added), default=0.0)
+    group = added[0].effect.group
+    others = (ratio for unit, ratio in told.items() if unit.effect.group != group)
+    return mine > max(_PLAIN, _FAR * max(others, default=0.0))
+
+
+def _places(unit: Unit, robot: Robot) -> set[tuple[str, int]]:
+    """Return the joints at which a unit acts, -1 where it is none, and whether on sensors."""
+    side = "sensing" if unit.effect.channel == "sensing" else "forces"
+    on = (target for target, part in enumerate(unit.direction) if part)
+    return {(side, unit.effect.joint(robot, target)) for target in on}
 
 
 def _does_something(unit: Unit, model: Model) -> bool:

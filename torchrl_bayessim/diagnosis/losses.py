@@ -10,10 +10,11 @@ place of the effects that the search found, and beside them.
 
 from __future__ import annotations
 
-__all__ = ["Evident", "evident", "losses", "lost_beside"]
+__all__ = ["Evident", "Suspects", "evident", "losses", "lost_beside"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -101,23 +102,60 @@ class Evident:
         return np.flatnonzero(self.unit.direction).tolist()
 
 
-def evident(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> Evident | None:
+@dataclass(frozen=True, eq=False)
+class Suspects:
+    """Short segments in which something may have been lost, and what may have been.
+
+    Attributes:
+        units: Random effects, of commands and of samples, each of what is lost as one.
+        nominal: The segments of each split, with parameters alone.
+        best: With the effects that last.
+    """
+
+    units: Sequence[Unit]
+    nominal: Mapping[str, LossSegments]
+    best: Mapping[str, LossSegments]
+
+    @classmethod
+    def of(cls, prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> Suspects | None:
+        """Return them, nothing where nothing can be lost or effects that last leave noise alone.
+
+        Nor where whole trajectories or statistics are compared.
+
+        Args:
+            prepared: Logs, noise and nominal fit.
+            selection: What the search without chance found.
+            units: All effects at their targets.
+        """
+        some = [u for u in units if isinstance(u.effect, PacketDrop | SensorDropout) and _as_one(u)]
+        if not some or type(prepared.mode) is not Mode:
+            return None
+        nominal = loss_segments(prepared)
+        best = {n: one.at(selection.best.fit.point) for n, one in nominal.items()}
+        found = cls(some, nominal, best)
+        return None if _explained(found.rival, selection.best) else found
+
+    @cached_property
+    def alone(self) -> _Alone:
+        """The parameters alone, without losses."""
+        return _Alone.of(self.nominal)
+
+    @cached_property
+    def rival(self) -> _Alone:
+        """The effects that last, without losses."""
+        return _Alone.of(self.best)
+
+
+def evident(suspects: Suspects, selection: Selection) -> Evident | None:
     """Return the likeliest losses of commands, if segments are much likelier with any.
 
     Args:
-        prepared: Logs, noise and nominal fit.
+        suspects: Short segments.
         selection: What the search without chance found.
-        units: Random effects at their targets.
     """
-    some = [u for u in units if isinstance(u.effect, PacketDrop) and _as_one(u)]
-    if not some or type(prepared.mode) is not Mode:
-        return None
-    nominal = loss_segments(prepared)
-    best = {n: one.at(selection.best.fit.point) for n, one in nominal.items()}
-    rival = _Alone.of(best)
-    if _explained(rival, selection.best):
-        return None
-    bases = [(nominal, _Alone.of(nominal)), *([(best, rival)] if selection.best.units else [])]
+    nominal, best, rival = suspects.nominal, suspects.best, suspects.rival
+    some = [u for u in suspects.units if isinstance(u.effect, PacketDrop)]
+    bases = [(nominal, suspects.alone), *([(best, rival)] if selection.best.units else [])]
     likely: tuple[float, Evident] | None = None
     for data, alone in bases:
         for unit in some:
@@ -159,28 +197,20 @@ def lost_beside(seen: Evident, model: Model) -> Chance | None:
     return _found(data, seen.unit, _Alone.of(data), beside=True)
 
 
-def losses(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> list[Chance]:
+def losses(prepared: Prepared, selection: Selection, suspects: Suspects) -> list[Chance]:
     """Return the losses that explain what is wrong with the segments that have them.
 
-    The likeliest first, with those that are nearly as likely; none where whole trajectories or
-    statistics are compared, or where effects that last leave noise alone.
+    The likeliest first, with those that are nearly as likely.
 
     Args:
         prepared: Logs, noise and nominal fit.
         selection: What the search without chance found.
-        units: Random effects at their targets; of those lost commands, of one actuator or of all
+        suspects: Short segments, and what may have been lost: commands, of one actuator or of all
             at once, and samples of one target.
     """
-    some = [u for u in units if isinstance(u.effect, PacketDrop | SensorDropout) and _as_one(u)]
-    if not some or type(prepared.mode) is not Mode:
-        return []
-    nominal = loss_segments(prepared)
-    best = {n: one.at(selection.best.fit.point) for n, one in nominal.items()}
-    rival = _Alone.of(best)
-    if _explained(rival, selection.best):
-        return []
-    some = _telling(prepared, some)
-    alone = _Alone.of(nominal)
+    some = _telling(prepared, suspects.units)
+    nominal, best, rival = suspects.nominal, suspects.best, suspects.rival
+    alone = suspects.alone
     # what the best explanation without chance gains by the same standard
     found, least = _all_found(nominal, some, alone), sum(alone.costs) - sum(rival.costs)
     if selection.best.units and _apart(selection.best.units):

@@ -19,9 +19,8 @@ import numpy as np
 from .arrivals import Arrivals
 from .chance import Chance
 from .elimination import parts
-from .losses import Evident, evident, lost_beside
+from .losses import Evident, Suspects, evident, lost_beside
 from .model import WHITE
-from .objective import Unit
 from .preparation import Prepared, with_other_commands
 from .selection import Selection
 
@@ -55,7 +54,7 @@ def beside_lost_commands(
     selection: Selection,
     found: Sequence[Chance],
     *,
-    units: Sequence[Unit],
+    suspects: Suspects,
     search: Callable[[Prepared], tuple[Prepared, Selection]],
     generator: np.random.Generator,
 ) -> Beside | None:
@@ -65,11 +64,11 @@ def beside_lost_commands(
         prepared: Logs with the commands that were sent.
         selection: The effects that last, found with those.
         found: What was found of losses, beside them or in their place.
-        units: All effects at their targets.
+        suspects: Short segments in which commands may have been lost.
         search: Searches for effects that last.
         generator: Of simulated noise.
     """
-    seen = evident(prepared, selection, units)
+    seen = evident(suspects, selection)
     if seen is None:
         return None
     some = _fewer(prepared, len(seen.actuators))

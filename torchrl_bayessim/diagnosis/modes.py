@@ -56,7 +56,7 @@ class Mode:
         *,
         history: int,
         alarms: list[str],
-        beside: Point | None = None,
+        beside: tuple[Point, Array] | None = None,
     ) -> tuple[Array, str]:
         """Return the standard deviation of each channel's noise, and where it comes from.
 
@@ -65,7 +65,8 @@ class Mode:
             logs: For training.
             history: Rows before a segment that effects look back at.
             alarms: To which is added what the reader must know.
-            beside: The simulator that leaves noise; default none of the effects.
+            beside: The simulator that leaves noise, default none of the effects; and the noise
+                that was found without them.
         """
         return measured_noise(predictor, logs, history=history, alarms=alarms, beside=beside)
 
@@ -177,7 +178,7 @@ class Summaries(Mode):
         *,
         history: int,  # noqa: ARG002
         alarms: list[str],  # noqa: ARG002
-        beside: Point | None = None,  # noqa: ARG002
+        beside: tuple[Point, Array] | None = None,  # noqa: ARG002
     ) -> tuple[Array, str]:
         """Return what is known without predictions."""
         noise = assumed_noise(predictor, logs)

@@ -67,7 +67,7 @@ def measured_noise(
     *,
     history: int,
     alarms: list[str],
-    beside: Point | None = None,
+    beside: tuple[Point, Array] | None = None,
 ) -> tuple[Array, str]:
     """Return each channel's noise: the differences of innovations, checked by the sensor's spec.
 
@@ -76,13 +76,14 @@ def measured_noise(
         logs: For training.
         history: Rows before a segment that effects look back at.
         alarms: To which is added what the reader must know.
-        beside: The simulator that leaves noise; default none of the effects.
+        beside: The simulator that leaves noise, default none of the effects; and the noise that
+            was measured without them, shape ``(C,)``.
     """
     system, known = predictor.system, _Known.of(predictor, logs)
-    noise = known.assumed
     pieces = _pieces(logs, history=history)
     pushes = pushes_of(system.robot)
-    at, estimate = beside or Point(origin(system.prior)), noise
+    at, noise = beside or (Point(origin(system.prior)), known.assumed)
+    estimate = noise
     for _ in range(_ROUNDS):
         white = whitening(predictor, pieces, parameters_at(system.prior, at.z), noise)
         objective = Objective(predictor, system.prior, pieces, white)

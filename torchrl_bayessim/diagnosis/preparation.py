@@ -177,8 +177,9 @@ def with_less_noise(
         return None
     predictor, history = prepared.predictor, prepared.sets["train"].segments.history
     alarms = [alarm for alarm in prepared.alarms if not alarm.startswith(UNCERTAIN)]
+    beside = found, prepared.noise
     noise, source = prepared.mode.noise(
-        predictor, prepared.logs["train"], history=history, alarms=alarms, beside=found
+        predictor, prepared.logs["train"], history=history, alarms=alarms, beside=beside
     )
     if (noise > _QUIETER * prepared.noise).all():
         return None

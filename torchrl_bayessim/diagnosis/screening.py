@@ -18,7 +18,7 @@ from __future__ import annotations
 
 __all__ = ["Screen", "crossing", "screen"]
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +30,7 @@ from .refit import Fit, with_prior
 Array = NDArray[np.float64]
 LEVELS = (0.05, 0.4)  # of an effect's range
 _BETWEEN = (0.08, 0.13, 0.2)  # where one period, or one limit, does not look like another
+_ALIKE = 0.02  # of a signature: what mixtures of others leave of one that is theirs
 _WILD = 500.0  # standard deviations
 _POWER = 0.84  # of the normal distribution at 0.8, to state what would have been seen
 _HELD_OUT = 2.0  # times that, for other runs to show it too
@@ -86,6 +87,33 @@ class Screen:
                 scaled = float(np.clip(amplitude, 0.1, 10.0) * strength)
                 result[unit] = float(ratio), unit.inside(scaled)
         return dict(sorted(result.items(), key=lambda item: -item[1][0]))
+
+    def beside(self, near: Collection[Unit]) -> dict[Unit, float]:
+        r"""Return what each other unit explains that no mixture of some could.
+
+        A likelihood ratio, at the unit's best strength. With the signatures :math:`N` of those that
+        are near, of correlations :math:`C`, and the scores :math:`z` of all::
+
+            z'_i = (z_i - C_{iN} C_{NN}^+ z_N) / \sqrt{1 - C_{iN} C_{NN}^+ C_{Ni}}.
+
+        Args:
+            near: Units whose signatures, at any strengths, are projected out.
+        """
+        whole = self.growth == self.growth.min(initial=np.inf)
+        seen = np.flatnonzero((self.norms > 0) & whole).tolist()
+        rows = np.array([i for i in seen if self.units[i] in near], dtype=int)
+        values, vectors = np.linalg.eigh(self.correlation[np.ix_(rows, rows)])
+        known = values > _ALIKE * values.max(initial=0.0)
+        basis = vectors[:, known] / np.sqrt(values[known])
+        part = self.correlation[:, rows] @ basis
+        scores = self.scores - part @ (basis.T @ self.scores[rows])
+        own = 1.0 - (part**2).sum(1)
+        result: dict[Unit, float] = {}
+        for i in seen:
+            if self.units[i] not in near and own[i] > _ALIKE:
+                ratio = float(max(scores[i], 0.0) ** 2 / own[i])
+                result[self.units[i]] = max(result.get(self.units[i], 0.0), ratio)
+        return result
 
     def null(self, draws: int, generator: np.random.Generator) -> Array:
         """Return largest likelihood ratios under noise alone, shape ``(draws,)``."""

@@ -17,6 +17,7 @@ from functools import partial
 
 import numpy as np
 
+from ..logs.system import System
 from .alternatives import alternatives, exchanged
 from .elimination import eliminated, without_stopgaps
 from .explanations import bent, compare, explanations
@@ -91,8 +92,7 @@ def select(
     """
     start = judged(train, validation, [nominal])[0]
     best, tried, screens, p_values, offered = start, [start], [], [], units
-    timestep = float(train.predictor.system.task.model.opt.timestep)
-    worth = partial(identified, start, timestep=timestep)
+    worth = _worth(start, train.predictor.system)
     for round_number in range(_MOST):
         progress(f"screening {len(units)} effects, round {round_number + 1}")
         enough = nothing_left(start, best)
@@ -114,8 +114,9 @@ def select(
         models = judged(train, validation, explanations(train, now))
         tried += models
         better = _chosen(best, models)
-        better = _fewest((train, validation), best, better, models, worth=worth, offered=offered)
-        if better is None or not worth(best, better, models):
+        plain = partial(worth, seen=now.seen)
+        better = _fewest((train, validation), best, better, models, worth=plain, offered=offered)
+        if better is None or not plain(best, better, models):
             break
         best = _exactly(train, validation, better)
         best = with_fitted_forms(train, validation, best, offered)
@@ -132,6 +133,12 @@ def select(
         train, validation, needs, units=units, tried=tried, first=screens[0], progress=progress
     )
     return Selection(start, best, tuple(screens), tuple(p_values), tuple(tried), others)
+
+
+def _worth(start: Model, system: System) -> Callable[..., bool]:
+    """Return what says whether a further effect is more than a stopgap on a robot."""
+    timestep = float(system.task.model.opt.timestep)
+    return partial(identified, start, timestep=timestep, robot=system.robot)
 
 
 def _anew(train: Objective, validation: Objective, known: Selection) -> list[Model]:
