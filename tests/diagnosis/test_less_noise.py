@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from torchrl_bayessim.diagnosis.objective import Point, units_of
-from torchrl_bayessim.diagnosis.preparation import prepare, with_less_noise
+from torchrl_bayessim.diagnosis.preparation import prepare
+from torchrl_bayessim.diagnosis.prepared_anew import with_less_noise
 from torchrl_bayessim.diagnosis.selection import select
 from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.envs.task import Task

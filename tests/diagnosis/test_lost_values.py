@@ -13,7 +13,7 @@ from test_diagnose import logs, system
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.loss_law import LossLaw, Tried, likeliest
-from torchrl_bayessim.diagnosis.losses import _explained
+from torchrl_bayessim.diagnosis.loss_suspects import _explained
 from torchrl_bayessim.diagnosis.model import Model
 from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.logs.log import Log

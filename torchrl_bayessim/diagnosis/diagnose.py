@@ -30,12 +30,14 @@ from .assembly import assemble
 from .chance import chances, detectable, of_chance, unseen
 from .holds import bridged
 from .late_sensors import LATE, free_riders, without_free_riders
-from .losses import Suspects, losses
+from .loss_suspects import Suspects
+from .losses import losses
 from .lost_commands import beside_lost_commands
 from .modes import MODES
 from .objective import Point, Unit, pushes_of, units_of
 from .onsets import with_onsets
-from .preparation import Prepared, prepare, with_less_noise
+from .preparation import Prepared, prepare
+from .prepared_anew import with_less_noise
 from .report import Report
 from .scatter import Scatter, Sent, gap_with_holds
 from .selection import Selection, select

@@ -10,72 +10,51 @@ place of the effects that the search found, and beside them.
 
 from __future__ import annotations
 
-__all__ = ["Evident", "Suspects", "evident", "losses", "lost_beside"]
+__all__ = ["Evident", "evident", "losses", "lost_beside"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..effects.action import PacketDrop
 from ..effects.contacts import ContactFriction
-from ..effects.sensors import SensorDropout
 from .chance import Chance
 from .contacts import resting
 from .loss_law import LossLaw, Told, Tried, likeliest
-from .loss_segments import LossSegments, loss_segments
+from .loss_segments import LossSegments
+from .loss_suspects import (
+    FEWEST,
+    JUDGED,
+    LEFT,
+    LIKELIER,
+    NOISE,
+    SCATTER,
+    SPOILED,
+    Alone,
+    Suspects,
+    spoiled_share,
+)
 from .model import Model
-from .modes import Mode
 from .objective import Point, Unit
 from .preparation import Prepared
 from .selection import Selection
 
 Array = NDArray[np.float64]
-_JUDGED = "train", "validation"  # splits that say what is lost
 _SHARES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.25, 0.4, 0.6)  # s
-_SCATTER = np.geomspace(0.5, 4.0, 10)  # φ
-_SPOILED = (0.003, 0.01, 0.03, 0.1, 0.3)  # η
 # deviances: to be found (contacts that come late look like a few losses), and that chance makes
 _NEEDED, _LIKELY = 40.0, 6.0
 _EXPLAINED = 0.5  # of the excess of the segments concerned, by what is left of them
-_NOISE = 1.2  # scatter that noise has
 _STANDS_OUT = 1.0  # excess of segments with lost commands, to be found beside an effect
 _BIASED = 0.1  # of the excess of the segments concerned, which parameters leave in all
-_LEFT = 2.0  # mean squared innovation of what has not explained the losses
 _OTHERS = 1 / 6  # of the segments that something else may have spoiled
 _REMAIN = 0.6  # or of those that were spoiled without losses
-_FEWEST = 4  # segments with a loss
 # to be evident, whatever else is wrong: deviance, errors without losses per those with them, and
 # segments that losses do not explain
 _EVIDENT, _TIMES, _WRONG = 100.0, 4.0, 0.3
 _INTERVAL = 3.92  # standard deviations that are 95 %
 _WIDER = 1.5  # times: errors were, on robots whose share was known
-_LIKELIER = 0.5  # probability that a segment has a loss, or is spoiled
-
-
-class _Alone(NamedTuple):
-    """The likeliest law without losses, its deviances, and the share of segments it gives up."""
-
-    law: LossLaw
-    costs: list[float]
-    spoiled: float
-    segments: int
-
-    @property
-    def calm(self) -> bool:
-        """Whether too few segments hold more than noise for losses to be found in them."""
-        return self.law.scatter < _NOISE and self.spoiled * self.segments < _FEWEST
-
-    @classmethod
-    def of(cls, data: Mapping[str, LossSegments]) -> _Alone:
-        """Return that of training and validation segments."""
-        judged, size = [data[name].without for name in _JUDGED], data["train"].left.shape[1]
-        law = likeliest(judged, (0.0,), _SCATTER.tolist(), _SPOILED, size=size)
-        told = Told.joined([law.told(one) for one in judged])
-        return cls(law, [law.deviance([one]) for one in judged], _spoiled(told), len(told.spoiled))
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,50 +81,6 @@ class Evident:
         return np.flatnonzero(self.unit.direction).tolist()
 
 
-@dataclass(frozen=True, eq=False)
-class Suspects:
-    """Short segments in which something may have been lost, and what may have been.
-
-    Attributes:
-        units: Random effects, of commands and of samples, each of what is lost as one.
-        nominal: The segments of each split, with parameters alone.
-        best: With the effects that last.
-    """
-
-    units: Sequence[Unit]
-    nominal: Mapping[str, LossSegments]
-    best: Mapping[str, LossSegments]
-
-    @classmethod
-    def of(cls, prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> Suspects | None:
-        """Return them, nothing where nothing can be lost or effects that last leave noise alone.
-
-        Nor where whole trajectories or statistics are compared.
-
-        Args:
-            prepared: Logs, noise and nominal fit.
-            selection: What the search without chance found.
-            units: All effects at their targets.
-        """
-        some = [u for u in units if isinstance(u.effect, PacketDrop | SensorDropout) and _as_one(u)]
-        if not some or type(prepared.mode) is not Mode:
-            return None
-        nominal = loss_segments(prepared)
-        best = {n: one.at(selection.best.fit.point) for n, one in nominal.items()}
-        found = cls(some, nominal, best)
-        return None if _explained(found.rival, selection.best) else found
-
-    @cached_property
-    def alone(self) -> _Alone:
-        """The parameters alone, without losses."""
-        return _Alone.of(self.nominal)
-
-    @cached_property
-    def rival(self) -> _Alone:
-        """The effects that last, without losses."""
-        return _Alone.of(self.best)
-
-
 def evident(suspects: Suspects, selection: Selection) -> Evident | None:
     """Return the likeliest losses of commands, if segments are much likelier with any.
 
@@ -159,15 +94,15 @@ def evident(suspects: Suspects, selection: Selection) -> Evident | None:
     likely: tuple[float, Evident] | None = None
     for data, alone in bases:
         for unit in some:
-            judged = [data[name].tried(unit) for name in _JUDGED]
-            scatters = _SCATTER.tolist()
-            law = likeliest(judged, _SHARES, scatters, _SPOILED, size=alone.law.size)
+            judged = [data[name].tried(unit) for name in JUDGED]
+            scatters = SCATTER.tolist()
+            law = likeliest(judged, _SHARES, scatters, SPOILED, size=alone.law.size)
             cost = law.deviance(judged)
             gained = sum(alone.costs) - cost
             plain = gained > _EVIDENT and _plain(law, judged)
             if plain and (likely is None or cost < likely[0]):
                 least = min(sum(other.costs) for _, other in bases)
-                likely = cost, Evident(unit, law, data[_JUDGED[0]].point, least, nominal)
+                likely = cost, Evident(unit, law, data[JUDGED[0]].point, least, nominal)
     return None if likely is None else likely[1]
 
 
@@ -178,8 +113,8 @@ def _plain(law: LossLaw, judged: Sequence[Tried]) -> bool:
     everywhere, and some of that looks like losses.
     """
     told = Told.joined([law.told(one) for one in judged])
-    concerned = told.lost > _LIKELIER
-    if concerned.sum() < _FEWEST or _spoiled(told) > _WRONG:
+    concerned = told.lost > LIKELIER
+    if concerned.sum() < FEWEST or spoiled_share(told) > _WRONG:
         return False
     return bool(told.before[concerned].mean() > _TIMES * told.after[concerned].mean())
 
@@ -194,7 +129,7 @@ def lost_beside(seen: Evident, model: Model) -> Chance | None:
     if not _apart(model.units):
         return None
     data = {name: one.at(model.fit.point) for name, one in seen.segments.items()}
-    return _found(data, seen.unit, _Alone.of(data), beside=True)
+    return _found(data, seen.unit, Alone.of(data), beside=True)
 
 
 def losses(prepared: Prepared, selection: Selection, suspects: Suspects) -> list[Chance]:
@@ -223,14 +158,6 @@ def losses(prepared: Prepared, selection: Selection, suspects: Suspects) -> list
     return [one for one in kept if one.gain > kept[0].gain - _LIKELY]
 
 
-def _explained(rival: _Alone, best: Model) -> bool:
-    """Return whether effects that last leave noise alone.
-
-    In short segments, where lost commands are hardly more than a lag, and in those of the search.
-    """
-    return bool(best.units) and rival.calm and best.dispersion() < _LEFT
-
-
 def _telling(prepared: Prepared, units: Sequence[Unit]) -> list[Unit]:
     """Return the units but for samples of what rests: it chatters, and one is like the next."""
     predictor = prepared.predictor
@@ -251,7 +178,7 @@ def _apart(others: Sequence[Unit]) -> bool:
 
 
 def _all_found(
-    data: Mapping[str, LossSegments], units: Sequence[Unit], alone: _Alone, *, beside: bool = False
+    data: Mapping[str, LossSegments], units: Sequence[Unit], alone: Alone, *, beside: bool = False
 ) -> list[Chance]:
     found = [_found(data, unit, alone, beside=beside) for unit in units]
     return [one for one in found if one is not None]
@@ -261,18 +188,8 @@ def _most(found: Sequence[Chance]) -> float:
     return max((one.gain for one in found), default=0.0)
 
 
-def _spoiled(told: Told) -> float:
-    return float((told.spoiled > _LIKELIER).mean())
-
-
-def _as_one(unit: Unit) -> bool:
-    """Return whether a unit is lost as one: a packet holds all commands, but no reading of all."""
-    alone = unit.where != "all" or len(unit.direction) == 1
-    return alone or isinstance(unit.effect, PacketDrop)
-
-
 def _found(
-    data: Mapping[str, LossSegments], unit: Unit, alone: _Alone, *, beside: bool
+    data: Mapping[str, LossSegments], unit: Unit, alone: Alone, *, beside: bool
 ) -> Chance | None:
     """Return the losses of a unit, nothing if they do not explain what they spoil.
 
@@ -280,21 +197,21 @@ def _found(
     everywhere a little, as if ever so many of them were lost.
     """
     tried, base = {name: one.tried(unit) for name, one in data.items()}, alone.law
-    judged = [tried[name] for name in _JUDGED]
-    scatters = [s for s in _SCATTER.tolist() if s <= base.scatter][-3:]
-    law = likeliest(judged, _SHARES, scatters, _SPOILED, size=base.size)
+    judged = [tried[name] for name in JUDGED]
+    scatters = [s for s in SCATTER.tolist() if s <= base.scatter][-3:]
+    law = likeliest(judged, _SHARES, scatters, SPOILED, size=base.size)
     gains = [cost - law.deviance([one]) for cost, one in zip(alone.costs, judged, strict=True)]
     if sum(gains) < _NEEDED or gains[1] < -_LIKELY:
         return None
     told = {name: law.told(one) for name, one in tried.items()}
-    known = Told.joined([told[name] for name in _JUDGED])
-    concerned = known.lost > _LIKELIER
-    if concerned.sum() < _FEWEST:
+    known = Told.joined([told[name] for name in JUDGED])
+    concerned = known.lost > LIKELIER
+    if concerned.sum() < FEWEST:
         return None
     excess = [float((one[concerned] - law.scatter).mean()) for one in (known.before, known.after)]
     # parameters that were fitted without losses are a little off everywhere
-    noise = max(_NOISE, min(_LEFT, 1.0 + _BIASED * excess[0]))
-    if law.scatter > noise or _spoiled(known) > max(_OTHERS, _REMAIN * alone.spoiled):
+    noise = max(NOISE, min(LEFT, 1.0 + _BIASED * excess[0]))
+    if law.scatter > noise or spoiled_share(known) > max(_OTHERS, _REMAIN * alone.spoiled):
         return None  # something else is wrong everywhere, and may look like this
     if excess[1] > _EXPLAINED * excess[0]:
         return None
@@ -303,9 +220,9 @@ def _found(
         return None
     share, low, high = np.minimum(law.share_within(judged), unit.high)
     shown = told["test"]
-    if (shown.lost > _LIKELIER).sum() < _FEWEST:  # so rare that test runs have hardly any
+    if (shown.lost > LIKELIER).sum() < FEWEST:  # so rare that test runs have hardly any
         shown = Told.joined(list(told.values()))
-    sound = shown.spoiled <= _LIKELIER
+    sound = shown.spoiled <= LIKELIER
     return Chance(
         unit=unit,
         strength=float(share),

@@ -19,9 +19,11 @@ import numpy as np
 from .arrivals import Arrivals
 from .chance import Chance
 from .elimination import parts
-from .losses import Evident, Suspects, evident, lost_beside
+from .loss_suspects import Suspects
+from .losses import Evident, evident, lost_beside
 from .model import WHITE
-from .preparation import Prepared, with_other_commands
+from .preparation import Prepared
+from .prepared_anew import with_other_commands
 from .selection import Selection
 
 _ROUNDS = 3  # of deciding which commands arrived and searching on

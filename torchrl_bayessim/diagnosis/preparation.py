@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["Prepared", "prepare", "with_less_noise", "with_other_commands"]
+__all__ = ["Prepared", "Started", "prepare"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from ..logs.system import System
 from .contacts import likelier, one_sided, settled
 from .hidden import hidden_joints
 from .modes import Mode, Trajectories, shortest
-from .noise import UNCERTAIN, assumed_noise
+from .noise import assumed_noise
 from .objective import Objective, Point, Unit, origin, parameters_at
 from .prediction import Predictor
 from .refit import Fit, refit, with_width
@@ -33,7 +33,6 @@ _FEWEST = 12  # rows of a run
 _STEPS = 20  # over which a joint that nobody measured would be seen
 _ROUNDS = 3  # in which what nobody measured and the parameters are fitted in turn
 _MANY = 60  # segments on which they are
-_QUIETER = 0.87  # times the noise: a quarter of its variance was the missing effect
 _FEW = 8  # segments on which the parameters are fitted first
 
 
@@ -129,7 +128,7 @@ def prepare(
     parts = _in_contact(predictor, parts, noise=noise, history=history)
     if horizon is None:
         horizon = mode.horizon(predictor, parts, units=units, noise=noise, history=history)
-    started = _Started(predictor, mode, history, horizon, noise, source, tuple(alarms))
+    started = Started(predictor, mode, history, horizon, noise, source, tuple(alarms))
     prepared = started.fitted(parts, generator)
     if few(logs):
         return prepared
@@ -137,61 +136,8 @@ def prepare(
     return prepared if again is parts else started.fitted(again, generator)
 
 
-def with_other_commands(
-    prepared: Prepared,
-    parts: Mapping[str, Sequence[Log]],
-    *,
-    generator: np.random.Generator,
-) -> Prepared:
-    """Return what a search starts from if other commands arrived than those that were sent.
-
-    Over the same horizon, with a noise of its own: what commands spoil that were lost is none.
-
-    Args:
-        prepared: With the commands that were sent.
-        parts: The logs of each split with those that arrived.
-        generator: As in `prepare`.
-    """
-    history, mode = prepared.sets["train"].segments.history, prepared.mode
-    predictor = prepared.predictor.divided(prepared.predictor.substeps)  # searches change theirs
-    predictor.steps, alarms = prepared.predictor.steps, list(prepared.alarms)
-    noise, source = mode.noise(predictor, parts["train"], history=history, alarms=alarms)
-    alarms = tuple(dict.fromkeys(alarms))
-    started = _Started(predictor, mode, history, prepared.horizon, noise, source, alarms)
-    return started.fitted(parts, generator)
-
-
-def with_less_noise(
-    prepared: Prepared, found: Point, *, generator: np.random.Generator
-) -> Prepared | None:
-    """Return the same with the noise that is left beside effects, if it is less somewhere.
-
-    What a missing effect does within a few steps looks like noise, and hides what else is missing.
-
-    Args:
-        prepared: With the noise beside the parameters alone.
-        found: The simulator with the effects that were found.
-        generator: As in `prepare`.
-    """
-    if not found.strengths or type(prepared.mode) is not Mode:
-        return None
-    predictor, history = prepared.predictor, prepared.sets["train"].segments.history
-    alarms = [alarm for alarm in prepared.alarms if not alarm.startswith(UNCERTAIN)]
-    beside = found, prepared.noise
-    noise, source = prepared.mode.noise(
-        predictor, prepared.logs["train"], history=history, alarms=alarms, beside=beside
-    )
-    if (noise > _QUIETER * prepared.noise).all():
-        return None
-    noise = np.minimum(noise, prepared.noise)
-    started = _Started(
-        predictor, prepared.mode, history, prepared.horizon, noise, source, tuple(alarms)
-    )
-    return started.fitted(prepared.logs, generator)
-
-
 @dataclass(frozen=True, eq=False)
-class _Started:
+class Started:
     """What is settled before the parameters are fitted."""
 
     predictor: Predictor

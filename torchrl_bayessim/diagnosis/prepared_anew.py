@@ -1,0 +1,70 @@
+"""What a search starts from once it is known what else there is: other commands, or less noise."""
+
+from __future__ import annotations
+
+__all__ = ["with_less_noise", "with_other_commands"]
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ..logs.log import Log
+from .modes import Mode
+from .noise import UNCERTAIN
+from .objective import Point
+from .preparation import Prepared, Started
+
+_QUIETER = 0.87  # times the noise: a quarter of its variance was the missing effect
+
+
+def with_other_commands(
+    prepared: Prepared,
+    parts: Mapping[str, Sequence[Log]],
+    *,
+    generator: np.random.Generator,
+) -> Prepared:
+    """Return what a search starts from if other commands arrived than those that were sent.
+
+    Over the same horizon, with a noise of its own: what commands spoil that were lost is none.
+
+    Args:
+        prepared: With the commands that were sent.
+        parts: The logs of each split with those that arrived.
+        generator: As in `prepare`.
+    """
+    history, mode = prepared.sets["train"].segments.history, prepared.mode
+    predictor = prepared.predictor.divided(prepared.predictor.substeps)  # searches change theirs
+    predictor.steps, alarms = prepared.predictor.steps, list(prepared.alarms)
+    noise, source = mode.noise(predictor, parts["train"], history=history, alarms=alarms)
+    alarms = tuple(dict.fromkeys(alarms))
+    started = Started(predictor, mode, history, prepared.horizon, noise, source, alarms)
+    return started.fitted(parts, generator)
+
+
+def with_less_noise(
+    prepared: Prepared, found: Point, *, generator: np.random.Generator
+) -> Prepared | None:
+    """Return the same with the noise that is left beside effects, if it is less somewhere.
+
+    What a missing effect does within a few steps looks like noise, and hides what else is missing.
+
+    Args:
+        prepared: With the noise beside the parameters alone.
+        found: The simulator with the effects that were found.
+        generator: As in `prepare`.
+    """
+    if not found.strengths or type(prepared.mode) is not Mode:
+        return None
+    predictor, history = prepared.predictor, prepared.sets["train"].segments.history
+    alarms = [alarm for alarm in prepared.alarms if not alarm.startswith(UNCERTAIN)]
+    beside = found, prepared.noise
+    noise, source = prepared.mode.noise(
+        predictor, prepared.logs["train"], history=history, alarms=alarms, beside=beside
+    )
+    if (noise > _QUIETER * prepared.noise).all():
+        return None
+    noise = np.minimum(noise, prepared.noise)
+    started = Started(
+        predictor, prepared.mode, history, prepared.horizon, noise, source, tuple(alarms)
+    )
+    return started.fitted(prepared.logs, generator)
