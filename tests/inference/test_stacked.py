@@ -3,7 +3,6 @@ import pickle
 import pytest
 import torch
 from tensordict import TensorDict
-from torch.optim.adamw import adamw
 
 from torchrl_bayessim.inference.descent import descend
 from torchrl_bayessim.inference.features import Features, FourierFeatures, NeuralFeatures
@@ -12,6 +11,7 @@ from torchrl_bayessim.inference.losses import PosteriorLoss
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.inference.stacked import StackedNetworks, alike
+from torchrl_bayessim.inference.steps import _fused_adamw
 from torchrl_bayessim.randomness import generator
 
 PRIOR = BoxPrior({"a": (0.0, 1.0), "b": (0.1, 2.0)})
@@ -284,12 +284,12 @@ def test_an_interrupted_fit_leaves_each_network_at_its_best_epoch(count, monkeyp
         steps.append(1)
         if len(steps) == 12:  # in the third epoch, of five steps each
             raise KeyboardInterrupt
-        adamw(*args, **kwargs)
+        _fused_adamw(*args, **kwargs)
 
     options = {"batch_size": 60, "epochs": 9, "progress": False}
     seeds = list(range(count))
     whole, broken = posteriors()[:count], posteriors()[:count]
-    monkeypatch.setattr("torchrl_bayessim.inference.steps.adamw", interrupted)
+    monkeypatch.setattr("torchrl_bayessim.inference.steps._fused_adamw", interrupted)
     with pytest.raises(KeyboardInterrupt):
         fit_several(broken, data, seeds=seeds, **options)
     monkeypatch.undo()

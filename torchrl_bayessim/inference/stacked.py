@@ -135,7 +135,8 @@ class StackedNetworks:
     def clip_gradients(self, largest: float) -> None:
         """Scale the gradient of each network down to a norm of at most ``largest``."""
         norm = torch.linalg.vector_norm(self.gradient, dim=1, keepdim=True)
-        self.gradient.mul_((largest / norm).clamp(max=1.0))
+        if not (norm <= largest).all():  # rare, and cheaper asked than done
+            self.gradient.mul_((largest / norm).clamp(max=1.0))
 
     @torch.no_grad()
     def keep(self, which: Tensor) -> None:
