@@ -125,7 +125,7 @@ ENTRIES = {
             "env": "object",
             "reward": "function",
             "algorithm": "name",
-            "actor_every": "count",
+            "actor_every": "count or none",
             "gamma": "share",
             "learning_rate": "rate",
             "tau": "share",
