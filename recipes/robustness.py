@@ -11,7 +11,8 @@ under physics drawn from the prior. Posterior and prior are compared in pairs: o
 seed, with its Student interval. Episodes by which a checkpoint is chosen are others.
 
 ``setting=strong`` trains CartPole's PPO with a longer view than the setting of rl-zoo, which the
-paper used. Writes result.json, table.md and a picture per parameter; ``resume=FOLDER`` goes on.
+paper used; ``setting=wide`` trains Push with larger networks and more updates, as older results
+have it. Writes result.json, table.md and a picture per parameter; ``resume=FOLDER`` goes on.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from typing import Any
 
 import recipe
 import torch
-from fetch_tasks import FETCH, GoalTask
+from fetch_tasks import FETCH, GoalTask, wide
 from robustness_report import compared, curves, draw_pictures, table
 from robustness_study import Study, nominal
 from tasks import TASKS, Task
@@ -59,7 +60,7 @@ class Robustness(recipe.Settings):
     sources: str = "nominal,prior,posterior,oracle"
     seeds: int = 0  # policies per source; 0 for 5 (CartPole) or 3 (Fetch)
     batches: int = 0  # of training per policy; 0 for the task's own number
-    setting: str = "paper"  # PPO's, or "strong"
+    setting: str = "paper"  # PPO's, or "strong"; of Push "wide"
     algorithm: str = ""  # ddpg or td3; empty for the task's own
     episodes: int = 8  # real episodes that the posterior is inferred from
     simulations: int = 512
@@ -115,10 +116,12 @@ def chosen(settings: Robustness) -> Task:
     known = {"cartpole": TASKS["cartpole"], **FETCH}
     if settings.task not in known:
         raise ValueError(message("a task", settings.task, available=known))
-    if settings.setting not in PPO_SETTINGS:
-        raise ValueError(message("a setting", settings.setting, available=PPO_SETTINGS))
     task = known[settings.task]
+    available = ("paper", "wide") if isinstance(task, GoalTask) else PPO_SETTINGS
+    if settings.setting not in available:
+        raise ValueError(message("a setting", settings.setting, available=available))
     if isinstance(task, GoalTask):
+        task = wide(task) if settings.setting == "wide" else task
         ddpg = dict(task.ddpg) | ({"algorithm": settings.algorithm} if settings.algorithm else {})
         if settings.short:
             ddpg |= {"hidden": (32, 32), "batch_size": 64, "updates_per_frame": 0.02}

@@ -7,8 +7,9 @@ final score may see runs it for a few episodes. A posterior over the friction is
 and DDPG with hindsight replay goes on under that posterior, with a new friction in every episode;
 then all again. The same training under the prior, with as many frames, is the baseline.
 ``algorithm=td3`` trains TD3 instead, ``preset=paper`` has the original budget and settings
-(1,000,000 frames, hours). Writes result.json, pictures, a video where rendering is possible, and
-checkpoints; ``resume=FOLDER`` goes on after a break.
+(1,000,000 frames, hours), ``preset=wide`` larger networks and more updates for Push. Writes
+result.json, pictures, a video where rendering is possible, and checkpoints; ``resume=FOLDER`` goes
+on after a break.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any
 
 import recipe
 from collectors import collectors
-from fetch_tasks import FETCH, MEASURED, GoalTask, paper
+from fetch_tasks import FETCH, MEASURED, GoalTask, paper, wide
 from rounds import Journal, compare, describe, draw_pictures, sentence, shown
 from scipy.stats import binomtest
 from tasks import true_parameters
@@ -42,7 +43,7 @@ from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.summaries import SummaryStatistics
 from torchrl_bayessim.transforms import DomainRandomizer
 
-PRESETS = ("fast", "paper")
+PRESETS = ("fast", "wide", "paper")
 
 
 @dataclass
@@ -58,7 +59,7 @@ class Sim2RealFetch(recipe.Settings):
     updates: int = 0  # batches per round under the posterior; 0 for the task's own number
     algorithm: str = ""  # ddpg or td3; empty for the task's own
     critic_sees_physics: bool = False
-    preset: str = "fast"  # or "paper"
+    preset: str = "fast"  # or "wide", or "paper"
     baseline: bool = True  # also go on under the prior, with as many frames
     collector: str = "direct"  # or "ray": the loop simulates in Ray's workers
     workers: int = 2  # of Ray
@@ -121,6 +122,8 @@ def chosen(settings: Sim2RealFetch) -> GoalTask:
     task = FETCH[settings.task]
     if settings.preset == "paper":
         task = paper(task, settings.rounds)
+    elif settings.preset == "wide":
+        task = wide(task)
     ddpg = dict(task.ddpg)
     if settings.algorithm:
         ddpg["algorithm"] = settings.algorithm

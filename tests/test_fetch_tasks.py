@@ -1,5 +1,6 @@
 """What the Fetch tasks of the recipes say about sliding objects."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -46,3 +47,23 @@ def test_episodes_put_together_count_like_one_long_one(fetch_tasks):
     apart = fetch_tasks.slowing(*pairs)[:, 0]
     together = fetch_tasks.slowing(*(part.flatten(0, 1)[None] for part in pairs))[:, 0]
     assert together.item() == pytest.approx(apart.mean().item())
+
+
+def test_push_makes_a_fifth_of_the_multiplications_of_its_wide_preset(fetch_tasks):
+    """Forward and backward, a network and its target: five products a layer of each update."""
+    task = fetch_tasks.FETCH["fetch_push"]
+    inputs, outputs = 28, 4
+
+    def products(task):
+        learner = task.learner(task.make(2, seed=0, randomizer=None))
+        widths = [inputs + outputs, *learner.settings["hidden"], 1]
+        network = sum(a * b for a, b in pairwise(widths))
+        every = learner.settings["actor_every"] or 1
+        return learner.updates_per_frame * network * (5 + 5 / every)
+
+    wide = fetch_tasks.wide(task)
+    assert products(task) / products(wide) == pytest.approx(0.2, abs=0.01)
+    frames = {t.budget * t.environments * t.horizon for t in (task, wide)}
+    assert frames == {480_000}
+    assert {t.warmup * t.environments for t in (task, wide)} == {4000}
+    assert fetch_tasks.wide(fetch_tasks.FETCH["fetch_slide"]).ddpg["algorithm"] == "td3"

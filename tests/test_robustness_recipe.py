@@ -76,6 +76,7 @@ def test_finished_policies_are_not_trained_again(finished, run, capsys):
         (["sources=posterior"], "expected the prior among the sources"),
         (["algorithm=td3"], "expected an algorithm for Fetch tasks only, got 'td3'"),
         (["setting=weak"], "expected a setting, got 'weak'. Available: paper, strong"),
+        (["task=fetch_push", "setting=strong"], "got 'strong'. Available: paper, wide"),
     ],
 )
 def test_bad_settings_are_explained(arguments, said, run, tmp_path, capsys):  # noqa: PLR0917

@@ -2,14 +2,14 @@
 
 Both collect episodes with DDPG's exploring policy and TorchRL's collector, draw a new friction for
 each episode, fill the hindsight replay buffer, and make as many gradient updates per frame; one
-steps 16 environments natively, the other a ``SerialEnv`` of 16 gymnasium environments. They take
+steps N environments natively, the other a ``SerialEnv`` of N gymnasium environments. They take
 turns, so ratios are within a run. While the native one steps in a thread of its own the learner
 makes its updates; Python simulators leave it no time. ``collect`` is the loop without its updates,
-``train`` the whole of it; environment frames per second. ``updates=0.2`` (per frame) is the
-recipe's setting::
+``train`` the whole of it; environment frames per second. Learner and N are those of the recipes'
+task; ``preset=wide`` has larger networks and more updates, as in `fetch_tasks.wide`::
 
-    python recipes/benchmarks/fetch_training.py [task=FetchPush-v4] [runs=5] [updates=0.2]
-        [matmul_precision=medium]
+    python recipes/benchmarks/fetch_training.py [task=fetch_push] [preset=wide] [runs=5]
+        [updates=0.2] [n=16] [matmul_precision=medium]
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import sys
 import warnings
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -27,41 +28,42 @@ import torch
 from measuring import compare, report
 from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymEnv, SerialEnv, TransformedEnv
 
-from torchrl_bayessim import ApplyPhysics, BoxPrior, DomainRandomizer, MujocoPhysics
+from torchrl_bayessim import ApplyPhysics, DomainRandomizer, MujocoPhysics
 from torchrl_bayessim.agents.ddpg import DDPG
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
-from torchrl_bayessim.envs.tasks.fetch import goal_reward
 from torchrl_bayessim.overlapped import Overlapped
 from torchrl_bayessim.randomness import isolated
 from torchrl_bayessim.simulate import make_collector, next_batch
 
-FRICTION = ("geom_friction[body:table0,0]", "geom_friction[object0,0]")
-PRIOR = BoxPrior({"friction": (0.1, 1.0)})
+sys.path.append(str(Path(__file__).parent.parent))
+from fetch_tasks import FETCH, FRICTION, GoalTask, wide
+
 STEPS = 50  # an episode
+GYM = ", gymnasium-robotics"
 
 
-def batched(task: str, n: int, threads: int) -> EnvBase:
+def batched(task: GoalTask, n: int, threads: int) -> EnvBase:
     """Return n environments, stepped natively."""
-    env = BatchedMujocoEnv(task, n, threads=threads)
+    env = BatchedMujocoEnv(task.simulator_name, n, threads=threads)
     physics = ApplyPhysics(MujocoPhysics(friction=FRICTION))
-    return TransformedEnv(env, Compose(physics, DomainRandomizer(PRIOR)))
+    return TransformedEnv(env, Compose(physics, DomainRandomizer(task.prior)))
 
 
-def one(task: str) -> EnvBase:
+def one(simulator_name: str) -> EnvBase:
     """Return one gymnasium-robotics environment."""
     physics = ApplyPhysics(MujocoPhysics(friction=FRICTION))
-    return TransformedEnv(GymEnv(task), Compose(physics, DoubleToFloat()))
+    return TransformedEnv(GymEnv(simulator_name), Compose(physics, DoubleToFloat()))
 
 
-def serial(task: str, n: int) -> EnvBase:
+def serial(task: GoalTask, n: int) -> EnvBase:
     """Return n gymnasium-robotics environments in this process."""
-    return TransformedEnv(SerialEnv(n, partial(one, task)), DomainRandomizer(PRIOR))
+    env = SerialEnv(n, partial(one, task.simulator_name))
+    return TransformedEnv(env, DomainRandomizer(task.prior))
 
 
-def loop(env: EnvBase, updates: float, batches: int) -> Callable[[], int]:
+def loop(env: EnvBase, learner: DDPG, batches: int) -> Callable[[], int]:
     """Return a case: ``batches`` batches of whole episodes, and the updates that go with them."""
     frames = env.batch_size.numel() * STEPS
-    learner = DDPG(env, goal_reward, updates_per_frame=updates)
     learning = Overlapped(learner)
     collector = make_collector(env, learner.policy, steps=STEPS)
 
@@ -69,7 +71,7 @@ def loop(env: EnvBase, updates: float, batches: int) -> Callable[[], int]:
         for index in range(batches):
             with isolated(index):
                 batch: Any = next_batch(collector, meanwhile=learning.meanwhile)
-            if updates:
+            if learner.updates_per_frame:
                 learning.update(batch, into={}, key=(index,))
             else:
                 learner.buffer.extend(batch.select(*learner.kept_keys))
@@ -80,25 +82,33 @@ def loop(env: EnvBase, updates: float, batches: int) -> Callable[[], int]:
 
 def main(*arguments: str) -> None:
     """Measure both loops in turn, without and with updates."""
-    given = {"task": "FetchPush-v4", "n": "16", "runs": "5", "updates": "0.2", "threads": "1"}
-    given |= {"batches": "1", "matmul_precision": "medium"}
+    given = {"task": "fetch_push", "preset": "", "n": "", "runs": "5", "updates": ""}
+    given |= {"threads": "1", "batches": "1", "matmul_precision": "medium"}
     given |= dict(argument.split("=", 1) for argument in arguments)
-    task, n, threads = given["task"], int(given["n"]), int(given["threads"])
+    task = FETCH[given["task"]]
+    if given["preset"] == "wide":
+        task = wide(task)
+    n, threads = int(given["n"] or task.environments), int(given["threads"])
+    batches = int(given["batches"])
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore")
     gymnasium.register_envs(gymnasium_robotics)
     torch.set_num_threads(threads)
     torch.set_float32_matmul_precision(given["matmul_precision"])
+    asked = {"updates_per_frame": float(given["updates"])} if given["updates"] else {}
     cases = {}
-    for name, updates in {"collect": 0.0, "train": float(given["updates"])}.items():
-        batches = int(given["batches"])
-        cases[name] = loop(batched(task, n, threads), updates, batches)
-        cases[f"{name}, gymnasium-robotics"] = loop(serial(task, n), updates, batches)
+    for name, options in {"collect": {"updates_per_frame": 0.0}, "train": asked}.items():
+        for kind, make in {"": partial(batched, threads=threads), GYM: serial}.items():
+            env = make(task, n)
+            learner = task.learner(env, **options)
+            cases[name + kind] = loop(env, learner, batches)
     rates = compare(cases, runs=int(given["runs"]))
     for name, values in rates.items():
-        other = f"{name}, gymnasium-robotics"
+        other = name + GYM
         against = {other: rates[other]} if other in rates else {}
-        context = {"task": task, "n": n, "threads": threads, "seed": 0, "updates": given["updates"]}
+        context = {"task": task.simulator_name, "n": n, "threads": threads, "seed": 0}
+        context |= {"algorithm": learner.name, "updates": learner.updates_per_frame}
+        context |= {"hidden": learner.settings["hidden"], "batches": batches}
         context["matmul_precision"] = given["matmul_precision"]
         report("fetch_training", name, values, against=against, **context)
 

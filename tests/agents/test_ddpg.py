@@ -87,6 +87,20 @@ def test_td3_has_two_critics_and_delays_its_actor(episodes):
     assert {n for n in names if "actor" in n} <= changed(before, learner._tensors())
 
 
+def test_a_delayed_actor_of_ddpg_learns_as_often_as_is_said_and_in_tables_too(episodes):
+    options = SMALL | {"updates_per_frame": 5 / 200}
+    names = {every: DDPG(push(), goal_reward, actor_every=every, **SMALL).name for every in (1, 3)}
+    assert names == {1: "DDPG+HER", 3: "DDPG+HER, actor once in 3 updates"}
+    td3 = {"algorithm": "td3", **SMALL}
+    assert DDPG(push(), goal_reward, actor_every=2, **td3).name == "TD3+HER"
+    assert DDPG(push(), goal_reward, actor_every=1, **td3).name == "TD3+HER, actor at every update"
+    learner = DDPG(push(), goal_reward, actor_every=2, **options)
+    learner.update(episodes, key=(0,))
+    steps = {part: adam.state_dict()["state"] for part, adam in learner._optimizers.items()}
+    counts = {part: {int(s["step"]) for s in state.values()} for part, state in steps.items()}
+    assert counts == {"actor": {2}, "critic": {5}}
+
+
 def test_the_critic_sees_the_physics_and_the_actor_never(episodes):
     learner = DDPG(push(), goal_reward, critic_keys=["theta"], **SMALL)
     learner.update(episodes, key=(0,))
@@ -287,6 +301,7 @@ def test_bad_batches_are_refused(episodes):
     [
         ({"algorithm": "td4"}, ValueError, r"got 'td4'. Available: td3 \(did you mean this\?\)"),
         ({"capacity": 63}, ValueError, "replay buffer of at least one batch of 64, got 63"),
+        ({"actor_every": 0}, ValueError, "updates per update of the actor.*got 0"),
         ({"critic_keys": ["thetaa"]}, ValueError, r"theta \(did you mean this\?\)"),
     ],
 )

@@ -45,8 +45,9 @@ class DDPG:
             It observes ``observation``, ``achieved_goal`` and ``desired_goal``.
         reward: Its reward, a function of the achieved and the desired goal.
         seed: Seed of the initial parameters and, with the key, of every update.
-        algorithm: ``ddpg`` or ``td3`` (two critics, target noise, an actor that learns at every
-            second update; target networks still follow at every one).
+        algorithm: ``ddpg`` or ``td3`` (two critics, target noise, a delayed actor).
+        actor_every: Updates of the critics per update of the actor; None for 1, or 2 of ``td3``.
+            Target networks follow at every update.
         critic_keys: What the critic sees besides, such as the physics parameters ``theta``: it is
             needed in training only, so it may know what the robot cannot (Pinto et al., 2018).
         hidden: Width of each hidden layer of actor and critics.
@@ -68,7 +69,7 @@ class DDPG:
     Attributes:
         policy: Reads observation and desired goal, writes ``action``; hand it to a collector. It
             explores unless `set_exploration_type` says otherwise.
-        name: ``DDPG+HER`` or ``TD3+HER``, for tables.
+        name: ``DDPG+HER`` or ``TD3+HER``, for tables, and what is unusual about its actor.
         buffer: The replay buffer.
         settings: What updates depend on; a loop refuses the checkpoint of other ones.
 
@@ -96,6 +97,7 @@ class DDPG:
         *,
         seed: int = 0,
         algorithm: str = "ddpg",
+        actor_every: int | None = None,
         critic_keys: Sequence[str] = (),
         hidden: Sequence[int] = (256, 256, 256),
         gamma: float = 0.98,
@@ -125,6 +127,9 @@ class DDPG:
         for width in hidden:
             check_count("units of a hidden layer", width)
         check_count("transitions per batch", batch_size)
+        usual = 1 + (algorithm == "td3")
+        every = usual if actor_every is None else actor_every
+        check_count("updates per update of the actor", every)
         check_count("transitions of capacity", capacity)
         shares = {"tau": tau, "decay_from": decay_from, "random_share": random_share}
         for name, value in {**shares, "gamma": gamma}.items():
@@ -138,8 +143,10 @@ class DDPG:
                 message(f"a replay buffer of at least one batch of {batch_size}", capacity)
             )
         self.name = f"{algorithm.upper()}+HER"
+        if every != usual:
+            self.name += f", actor {f'once in {every} updates' if every > 1 else 'at every update'}"
         self.batch_size = batch_size
-        self.updates_per_frame, self._actor_every = updates_per_frame, 1 + (algorithm == "td3")
+        self.updates_per_frame, self._actor_every = updates_per_frame, every
         self._rates = learning_rate, final_learning_rate, decay_from
         self.state = GoalState(env, critic_keys)
         self._bounds = action_bounds(env)
