@@ -1,6 +1,6 @@
 """Places of an effect, and effects, that a model has for nothing."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -46,6 +46,6 @@ def test_more_strengths_do_not_take_the_place_of_fewer_that_are_as_good(share, c
     rng = np.random.default_rng(0)
     best, more = plain([A], 5000.0), plain([Unit("delay", "x"), Unit("delay", "y")], 5000.0)
     each = rng.uniform(0.5, 1.5, len(best.validation))[:, None]  # better here, worse there
-    fit = SimpleNamespace(units=more.units, innovations=np.sqrt(share) * each * more.validation)
+    fit = replace(more.fit, innovations=np.sqrt(share) * each * more.validation)
     other = Model(fit=fit, validation=fit.innovations, logs=more.logs)
     assert (exchanged(best, {"gain": (other,)}) is other) == changed
