@@ -18,7 +18,8 @@ the edge of the prior, twice the noise of the data sheet, actions shuffled betwe
 and the same case twice, the second time with every name drawn anew.
 ``baselines=true`` asks other methods too (see ``baselines/methods.py``), on the same folders.
 Causes below ``threshold`` (see ``withheld/detectability.py``) cannot be seen by anyone, and are
-left out of the scores of T1 to T6; ``by_detectability`` has them. Of a pair, each is to be seen.
+left out of the scores of T1 to T6; ``by_detectability`` has them. Of a pair, each is to be seen,
+alone and beside the other.
 """
 
 from __future__ import annotations
