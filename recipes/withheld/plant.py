@@ -10,6 +10,7 @@ from __future__ import annotations
 __all__ = ["Cause", "Motion", "Plant", "Truth"]
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -159,13 +160,25 @@ class Plant:
         self._begin(states[0, :nv], states[0, nv:])
         rows = []
         for k, command in enumerate(commands):
-            rows.append(self._read())
+            rows.append(self._aside() if k in at else self._read())
             if k in at:
                 self._place(states[k, :nv], states[k, nv:])
+                self._read()  # what sensors remember of the row is the state that follows
             self.commands.append(command)
             for _ in range(self.substeps):
                 self._step()
         return np.array(rows)
+
+    def _aside(self) -> Array:
+        """Return what is measured, which no cause remembers."""
+        memories = [deepcopy(cause.memory) for cause in self.causes]
+        row = self._read()
+        for cause, memory in zip(self.causes, memories, strict=True):
+            cause.memory.clear()
+            cause.memory.update(memory)
+        for rows in (self.states, self.acts, self.sensed):
+            rows.pop()
+        return row
 
     def _begin(self, q: Array, v: Array) -> None:
         """Start a trajectory: nothing was commanded, and no cause remembers anything."""

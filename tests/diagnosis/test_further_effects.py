@@ -114,7 +114,8 @@ def screened(ratios):
     """Return what a screen says that no law near the base could have, and whom it was asked of."""
     asked = []
 
-    def beside(near):
+    def beside(near, dispersion):
+        assert dispersion > 1.0
         asked.extend(near)
         return {unit: ratio for unit, ratio in ratios.items() if unit not in near}
 

@@ -70,16 +70,16 @@ def test_what_others_could_have_explained_is_not_counted():
     """The likelihood ratio is the squared norm that least squares gain beside the others."""
     columns = np.random.default_rng(0).normal([1.0, 1.0, 0.0], size=(200, 3))
     left = columns @ [2.0, 0.5, 1.0]
-    found = drawn(columns, left, ("a", "b", "c")).beside({"a"})
+    found = drawn(columns, left, ("a", "b", "c")).beside({"a"}, 2.0)
     assert found.keys() == {"b", "c"}
     for i, name in ((1, "b"), (2, "c")):
         squares = [np.linalg.lstsq(columns[:, some], left)[1][0] for some in ([0], [0, i])]
-        assert found[name] == pytest.approx(squares[0] - squares[1])
+        assert found[name] == pytest.approx((squares[0] - squares[1]) / 2.0)
 
 
 def test_what_others_explain_wholly_is_left_out():
     columns = np.random.default_rng(1).normal(size=(200, 2))
     columns = np.c_[columns, columns @ [1.0, -1.0]]
-    assert not drawn(columns, columns[:, 2], ("a", "b", "c")).beside({"a", "b"})
+    assert not drawn(columns, columns[:, 2], ("a", "b", "c")).beside({"a", "b"}, 1.0)
     # and what explains the opposite explains nothing
-    assert drawn(columns, -columns[:, 0], ("a", "b", "c")).beside({"b"})["a"] == 0.0
+    assert drawn(columns, -columns[:, 0], ("a", "b", "c")).beside({"b"}, 1.0)["a"] == 0.0

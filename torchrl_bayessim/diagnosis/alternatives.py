@@ -17,7 +17,7 @@ from ..effects.effect import Effect
 from ..effects.joints import CoulombFriction
 from ..effects.transmission import ServoDeadBand
 from .explanations import compare
-from .model import LIKELY, Model, as_good, criterion, gain, judged, needed
+from .model import LIKELY, Model, as_good, criterion, gain, judged, needed, numbers
 from .objective import Objective, Point, Unit
 from .refit import WIDE, refit
 from .screening import Screen
@@ -193,7 +193,8 @@ def exchanged(best: Model, others: Mapping[str, Sequence[Model]]) -> Model:
         return best  # something is wrong with both, and more strengths mend more of it
     if better_by > LIKELY:
         return first
-    return next((m for m in every if leaves_less_to_do(best, m)), best)
+    plainer = [m for m in every if leaves_less_to_do(best, m)]
+    return min(plainer, key=lambda m: criterion(m, best.dispersion()), default=best)
 
 
 def leaves_less_to_do(best: Model, other: Model) -> bool:
@@ -205,7 +206,7 @@ def leaves_less_to_do(best: Model, other: Model) -> bool:
     shared = [unit for unit in mine if unit in others]
     instead = {u.effect.group for u in others if u not in mine}
     alike = instead == {u.effect.group for u in mine if u not in others} and len(instead) == 1
-    if not shared or not alike or len(others) > len(mine):
+    if not shared or not alike or numbers(other) > numbers(best):
         return False
     before, after = (np.array([abs(s[u] / u.high) for u in shared]) for s in (mine, others))
     made_up_for = (after < _LESS * before).any() and after.sum() < before.sum()

@@ -65,7 +65,8 @@ def fewest(
     several, smaller = len(_new_names(base, better)) > 1, None
     if several:
         smaller = chosen(base, singles)
-        if smaller is not None and not worth(smaller, better, models):
+        # a screen of the base says nothing of what is beside the smaller one
+        if smaller is not None and not worth(smaller, better, models, seen=None):
             return better if _no_simpler(sets, smaller, better, offered) else smaller
     elif better.mean_square < WHITE:
         return better

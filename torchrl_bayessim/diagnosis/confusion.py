@@ -153,7 +153,8 @@ def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> S
     least = min(deviances.values())
     same = [model for model in equals if deviances[model] - least < _SAME]
     first = min(same, key=lambda model: (_sensing(model), deviances[model]))
-    first = next((model for model in equals if leaves_less_to_do(first, model)), first)
+    plainer = [m for m in equals if leaves_less_to_do(first, m) and _sensing(m) <= _sensing(first)]
+    first = min(plainer, key=deviances.__getitem__, default=first)
     if first is selection.best:
         return selection
     chosen, first = first, without_idle(sets["train"], sets["validation"], first)

@@ -186,7 +186,7 @@ def _searched(
         units = with_shapes(units, shapes(prepared.nominal.point))
         units = with_onsets(prepared.sets["train"], prepared.nominal.point, units)
     else:
-        units = list(dict.fromkeys(known.screens[0].units))
+        units = known.offered
     search = partial(
         select,
         prepared.sets["train"],
@@ -202,7 +202,7 @@ def _searched(
     seen = prepared.sets["train"], prepared.noise
     if free_riders(*seen, selection.nominal, [selection.best]):
         prepared = prepared.alarmed(_TOO_SHORT.format(prepared.horizon))
-        selection = search([unit for unit in units if unit.name not in LATE])
+        selection = search([unit for unit in units if unit.name not in LATE], known=None)
     return prepared, without_free_riders(*seen, selection)
 
 

@@ -107,7 +107,7 @@ def _elsewhere(base: Model, better: Model, seen: Screen, robot: Robot) -> bool:
         return False
     places = {place for unit in base.units for place in _places(unit, robot)}
     near = {unit for unit in seen.units if _places(unit, robot) <= places}
-    told = seen.beside(near)
+    told = seen.beside(near, base.dispersion())
     mine = max((told.get(unit, 0.0) for unit in added), default=0.0)
     group = added[0].effect.group
     others = (ratio for unit, ratio in told.items() if unit.effect.group != group)

@@ -88,7 +88,7 @@ class Screen:
                 result[unit] = float(ratio), unit.inside(scaled)
         return dict(sorted(result.items(), key=lambda item: -item[1][0]))
 
-    def beside(self, near: Collection[Unit]) -> dict[Unit, float]:
+    def beside(self, near: Collection[Unit], dispersion: float) -> dict[Unit, float]:
         r"""Return what each other unit explains that no mixture of some could.
 
         A likelihood ratio, at the unit's best strength. With the signatures :math:`N` of those that
@@ -98,6 +98,7 @@ class Screen:
 
         Args:
             near: Units whose signatures, at any strengths, are projected out.
+            dispersion: Variance of what is left.
         """
         whole = self.growth == self.growth.min(initial=np.inf)
         seen = np.flatnonzero((self.norms > 0) & whole).tolist()
@@ -111,7 +112,7 @@ class Screen:
         result: dict[Unit, float] = {}
         for i in seen:
             if self.units[i] not in near and own[i] > _ALIKE:
-                ratio = float(max(scores[i], 0.0) ** 2 / own[i])
+                ratio = float(max(scores[i], 0.0) ** 2 / own[i] / dispersion)
                 result[self.units[i]] = max(result.get(self.units[i], 0.0), ratio)
         return result
 

@@ -47,6 +47,7 @@ class Selection:
         p_values: Of the largest likelihood ratio of each round.
         tried: Every model that was fitted.
         alternatives: For each effect of the best model, the models with another in its place.
+        offered: The units that were considered, with effects as they were offered.
     """
 
     nominal: Model
@@ -55,6 +56,7 @@ class Selection:
     p_values: tuple[float, ...]
     tried: tuple[Model, ...]
     alternatives: dict[str, tuple[Model, ...]]
+    offered: tuple[Unit, ...] = ()
 
 
 def select(
@@ -95,15 +97,15 @@ def select(
         now = compare(train, best.fit, left, glance=enough)
         screens.append(now.seen)
         p_values.append(_p_value(now.seen, best, generator))
-        # where much is left, what a first derivative does not see may still be the cause
-        if enough or (p_values[-1] > alpha and not bent(best.fit)):
-            break
-        progress("fitting explanations")
         if known is not None and not best.units:
             models = _anew(train, validation, known)
             best, tried = models[0], [start, *models]
             units = _with_forms(units, best)
             continue
+        # where much is left, what a first derivative does not see may still be the cause
+        if enough or (p_values[-1] > alpha and not bent(best.fit)):
+            break
+        progress("fitting explanations")
         models = judged(train, validation, explanations(train, now))
         tried += models
         better = chosen(best, models)
@@ -125,7 +127,8 @@ def select(
     best, others = _settled(
         train, validation, needs, units=units, tried=tried, first=screens[0], progress=progress
     )
-    return Selection(start, best, tuple(screens), tuple(p_values), tuple(tried), others)
+    found = start, best, tuple(screens), tuple(p_values), tuple(tried), others
+    return Selection(*found, offered=tuple(offered))
 
 
 def _worth(start: Model, system: System) -> Callable[..., bool]:
@@ -136,9 +139,12 @@ def _worth(start: Model, system: System) -> Callable[..., bool]:
 
 def _anew(train: Objective, validation: Objective, known: Selection) -> list[Model]:
     """Return the best model that was found, and the others that were tried, fitted again."""
-    best = known.best.fit.point
-    others = [m.fit.point for m in known.tried if m.units and m is not known.best]
-    return judged(train, validation, refit(train, [best, *others], iterations=_AGAIN))
+    each: dict[frozenset[Unit], Model] = {frozenset(known.best.units): known.best}
+    for model in sorted(known.tried, key=lambda m: m.mean_square):
+        if model.units:
+            each.setdefault(frozenset(model.units), model)
+    points = [model.fit.point for model in each.values()]
+    return judged(train, validation, refit(train, points, iterations=_AGAIN))
 
 
 def _settled(
