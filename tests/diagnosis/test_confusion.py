@@ -116,6 +116,7 @@ def test_friction_one_way_and_half_of_it_as_a_push_is_friction_both_ways(monkeyp
     "instead",
     [
         {"coulomb_friction": 0.17, "action_bias": 0.1},  # as much to make up for
+        {"coulomb_friction": 0.4, "action_bias": 0.05},  # more in all
         {"armature": 0.17, "action_bias": 0.03},  # of another kind
         {"coulomb_friction": 0.17},  # which had nothing to do
     ],

@@ -25,6 +25,7 @@ from .screening import Screen
 _ALIKE = 4  # models with an effect of the same group in its place
 _RIVALS = 6  # models with another effect in the place of one
 _MORE, _LITTLE = 5.0, 0.05  # mean squared innovation; share of friction's range, to start from
+_SMALLER = 0.75  # times: all strengths of an equal that is plainer
 _LESS = 0.5  # times: of what an effect did that made up for another
 _ALONG = (0.25, 0.5)  # of the range of friction in contacts, to start from
 
@@ -201,6 +202,8 @@ def leaves_less_to_do(best: Model, other: Model) -> bool:
     """Return whether the others have little to do beside another effect of a kind that is as good.
 
     Friction in one direction and a push that is half of it against the other are friction in both.
+    All strengths together have to be smaller, as shares of their ranges: the other way round a push
+    beside friction in both directions would be less push beside friction in one.
     """
     mine, others = best.fit.point.strengths, other.fit.point.strengths
     shared = [unit for unit in mine if unit in others]
@@ -209,5 +212,7 @@ def leaves_less_to_do(best: Model, other: Model) -> bool:
     if not shared or not alike or numbers(other) > numbers(best):
         return False
     before, after = (np.array([abs(s[u] / u.high) for u in shared]) for s in (mine, others))
-    made_up_for = (after < _LESS * before).any() and after.sum() < before.sum()
+    sizes = (sum(abs(s / u.high) for u, s in every.items()) for every in (mine, others))
+    whole, smaller = sizes
+    made_up_for = (after < _LESS * before).any() and smaller < _SMALLER * whole
     return bool(made_up_for) and as_good(best, other)
