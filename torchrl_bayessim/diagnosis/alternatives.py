@@ -205,14 +205,17 @@ def leaves_less_to_do(best: Model, other: Model) -> bool:
     All strengths together have to be smaller, as shares of their ranges: the other way round a push
     beside friction in both directions would be less push beside friction in one.
     """
-    mine, others = best.fit.point.strengths, other.fit.point.strengths
-    shared = [unit for unit in mine if unit in others]
-    instead = {u.effect.group for u in others if u not in mine}
-    alike = instead == {u.effect.group for u in mine if u not in others} and len(instead) == 1
-    if not shared or not alike or numbers(other) > numbers(best):
+    mine, others = _shares(best), _shares(other)
+    shared = mine.keys() & others.keys()
+    instead = {u.effect.group for u in others.keys() - shared}
+    alike = instead == {u.effect.group for u in mine.keys() - shared} and len(instead) == 1
+    if not alike or numbers(other) > numbers(best):
         return False
-    before, after = (np.array([abs(s[u] / u.high) for u in shared]) for s in (mine, others))
-    sizes = (sum(abs(s / u.high) for u, s in every.items()) for every in (mine, others))
-    whole, smaller = sizes
-    made_up_for = (after < _LESS * before).any() and smaller < _SMALLER * whole
-    return bool(made_up_for) and as_good(best, other)
+    made_up_for = any(others[unit] < _LESS * mine[unit] for unit in shared)
+    smaller = sum(others.values()) < _SMALLER * sum(mine.values())
+    return made_up_for and smaller and as_good(best, other)
+
+
+def _shares(model: Model) -> dict[Unit, float]:
+    """Return the size of each strength as a share of its range."""
+    return {unit: abs(s / unit.high) for unit, s in model.fit.point.strengths.items()}
