@@ -58,6 +58,16 @@ def test_the_parameters_of_the_best_epoch_are_kept_of_each_network():
         assert loss == pytest.approx(min(validation), abs=1e-4)
 
 
+def test_overfitting_ends_it_by_itself_but_not_before_the_box():
+    prior = BoxPrior({"a": (0.0, 1.0), "b": (0.0, 1.0)})
+    held, own = pairs(prior, 200, key=1), {"patience": None, "seeds": [0, 1]}
+    nets = [MixtureDensityPosterior(prior, 2, components=1, seed=seed) for seed in (0, 1)]
+    traces = descend(nets, pairs(prior, 24), held, epochs=60, **OPTIONS | own)
+    mean = [sum(losses) / 2 for losses in zip(*(trace[1] for trace in traces), strict=True)]
+    best = mean.index(min(mean))
+    assert len(mean) == max(best + 1, min(best + 1 + 25, 36)) + 7  # the box, then 12 % of 60 epochs
+
+
 def test_the_box_comes_in_before_the_end():
     """Summaries that say nothing: the posterior is flat to its edges, the entropy 0."""
     prior = BoxPrior({"a": (0.0, 1.0)})

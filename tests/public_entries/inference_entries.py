@@ -20,7 +20,7 @@ FIT = {
     "batch_size": "count",
     "lr": "rate",
     "validation_fraction": "rate",
-    "patience": "count",
+    "patience": "count or none",
 }
 
 ENTRIES = {

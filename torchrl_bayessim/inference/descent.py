@@ -29,6 +29,8 @@ from .steps import Steps
 from .weights import weights_of
 
 _FREE = 0.6  # share of the epochs that do without the box
+_PATIENCE = 25  # epochs without improvement
+_IN_VAIN = 0.12  # at most, as a share of the epochs, once the box is in
 _GATHERED = 64  # minibatches of which the pairs are gathered at once
 
 
@@ -48,7 +50,7 @@ def descend(
     batch_size: int,
     lr: float,
     weight_decay: float,
-    patience: int,
+    patience: int | None,
     seeds: Sequence[int],
     progress: bool,
 ) -> list[tuple[list[float], list[float]]]:
@@ -64,8 +66,9 @@ def descend(
         batch_size: Pairs per step.
         lr: Highest learning rate.
         weight_decay: Of AdamW.
-        patience: Epochs without improvement after which the box comes in, and then the end: of
-            all posteriors.
+        patience: Epochs that do not improve the mean loss of all posteriors, after which the box
+            comes in, and then the end. None for 25, but with the box, where the learning rate is
+            low, for no more than 12 % of ``epochs``: what is overfitted by then only gets worse.
         seeds: Of the minibatches, one for each posterior.
         progress: Whether to show a progress bar.
 
@@ -110,7 +113,7 @@ def _epochs(
     batch_size: int,
     lr: float,
     weight_decay: float,
-    patience: int,
+    patience: int | None,
     shuffles: Sequence[torch.Generator],
     progress: bool,
 ) -> list[tuple[Tensor, Tensor]]:
@@ -120,8 +123,10 @@ def _epochs(
     length = math.ceil(count / math.ceil(count / batch_size))
     gathered = max(1, min(_GATHERED, PART // (size * length)))
     step = Steps(networks, epochs * math.ceil(count / length), lr=lr, weight_decay=weight_decay)
-    best = torch.full((size,), math.inf)
+    best, least = torch.full((size,), math.inf), math.inf
     truncated, stale = first.prior.box is None, 0
+    in_vain = patience or min(_PATIENCE, max(1, round(_IN_VAIN * epochs)))
+    patience = patience or _PATIENCE
     trace: list[tuple[Tensor, Tensor]] = []
     bar = tqdm(range(epochs), desc="fit", disable=not progress, leave=False, unit="epoch")
     for epoch in bar:
@@ -136,11 +141,13 @@ def _epochs(
         learned, held_out = (total / weight).cpu(), _loss(first, networks, held).cpu()
         trace.append((_checked(learned), _checked(held_out)))
         bar.set_postfix(train=f"{learned.mean():.2f}", held_out=f"{held_out.mean():.2f}")
-        better, stale = held_out < best - 1e-4, stale + 1
+        better = held_out < best - 1e-4
         if better.any():
-            best, stale = torch.where(better, held_out, best), 0
+            best = torch.where(better, held_out, best)
             networks.keep(better)
-        if truncated and stale >= patience:
+        mean = held_out.mean().item()
+        least, stale = (mean, 0) if mean < least - 1e-4 else (least, stale + 1)
+        if truncated and stale >= in_vain:
             break
     return trace
 

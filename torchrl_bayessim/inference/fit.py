@@ -66,7 +66,7 @@ def fit(
     lr: float = 1e-2,
     weight_decay: float = 1e-4,
     validation_fraction: float = 0.1,
-    patience: int = 25,
+    patience: int | None = None,
     rescale: bool = True,
     seed: int = 0,
     split_seed: int | None = None,
@@ -97,7 +97,8 @@ def fit(
         weight_decay: Of AdamW.
         validation_fraction: Share of the pairs that is held out: at least one, all but two at
             most, and no more than 16,384.
-        patience: Epochs without improvement after which it stops: see :func:`.descent.descend`.
+        patience: Epochs without improvement after which it stops, None to leave it to the number
+            of epochs: see :func:`.descent.descend`.
         rescale: Whether to set the input scaling from these pairs (yes on the first fit).
         seed: Of the split and of the minibatches.
         split_seed: Of the split, if not ``seed``: networks that share it hold out the same pairs.
@@ -223,7 +224,8 @@ def _check(
     check_number("lr", options["lr"], above=0.0)
     check_number("weight_decay", options["weight_decay"], least=0.0)
     for name in ("epochs", "batch_size", "patience"):
-        check_count(name, options[name])
+        if name != "patience" or options[name] is not None:
+            check_count(name, options[name])
 
 
 def _defaults() -> dict[str, Any]:
