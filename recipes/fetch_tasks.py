@@ -20,6 +20,7 @@ from torchrl.envs import EnvBase
 from torchrl_bayessim.agents.ddpg import DDPG
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.envs.tasks.fetch import goal_reward
+from torchrl_bayessim.errors import message
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
 from torchrl_bayessim.summaries import cross_correlation, linear_dynamics
@@ -165,10 +166,28 @@ PAPER = {
 }
 
 
+PRESETS = ("fast", "wide", "paper")
+
+
+def as_preset(task: GoalTask, preset: str, *, rounds: int = 1) -> GoalTask:
+    """Return the task with the settings of one of the presets.
+
+    Raises:
+        ValueError: There is no such preset, or it is the task's own already.
+    """
+    if preset not in PRESETS:
+        raise ValueError(message("a preset", preset, available=PRESETS))
+    if preset == "wide" and task.ddpg is not PUSH:
+        got = f"{preset} on {task.simulator_name}"
+        hint = "fast, which on this task has the large networks"
+        raise ValueError(message("a preset that changes something", got, hint=hint))
+    return {"fast": lambda: task, "wide": lambda: wide(task), "paper": lambda: paper(task, rounds)}[
+        preset
+    ]()
+
+
 def wide(task: GoalTask) -> GoalTask:
-    """Return Push with DDPG's own settings, in 16 environments, and any other task as it is."""
-    if task.ddpg is not PUSH:
-        return task
+    """Return Push with DDPG's own settings, in 16 environments."""
     return replace(
         task,
         environments=16,

@@ -10,9 +10,10 @@ the same episodes: over a grid of each parameter with the others at the truth, a
 under physics drawn from the prior. Posterior and prior are compared in pairs: one difference per
 seed, with its Student interval. Episodes by which a checkpoint is chosen are others.
 
-``setting=strong`` trains CartPole's PPO with a longer view than the setting of rl-zoo, which the
-paper used; ``setting=wide`` trains Push with larger networks and more updates, as older results
-have it. Writes result.json, table.md and a picture per parameter; ``resume=FOLDER`` goes on.
+CartPole's PPO has two settings, ``paper``, that of rl-zoo, which the paper used, and ``strong``, of
+a longer view; DDPG's on Fetch are ``fast``, ``wide``, larger networks and more updates for Push, as
+older results have it, and ``paper``, the original budget. Writes result.json, table.md and a
+picture per parameter; ``resume=FOLDER`` goes on.
 """
 
 from __future__ import annotations
@@ -24,12 +25,13 @@ from typing import Any
 
 import recipe
 import torch
-from fetch_tasks import FETCH, GoalTask, wide
+from fetch_tasks import FETCH, PRESETS, GoalTask, as_preset
 from robustness_report import compared, curves, draw_pictures, table
 from robustness_study import Study, nominal
 from tasks import TASKS, Task
 from torch import Tensor
 
+from torchrl_bayessim.counts import check_count
 from torchrl_bayessim.errors import message
 from torchrl_bayessim.whole_file import write_text
 
@@ -51,6 +53,16 @@ PPO_SETTINGS: dict[str, dict[str, Any]] = {
     },
 }
 
+COUNTS = {
+    "seeds": 0,
+    "batches": 0,  # 0 for the task's own
+    "episodes": 1,
+    "simulations": 8,
+    "points": 1,
+    "grid_episodes": 1,
+    "real_episodes": 1,
+}
+
 
 @dataclass
 class Robustness(recipe.Settings):
@@ -60,11 +72,11 @@ class Robustness(recipe.Settings):
     sources: str = "nominal,prior,posterior,oracle"
     seeds: int = 0  # policies per source; 0 for 5 (CartPole) or 3 (Fetch)
     batches: int = 0  # of training per policy; 0 for the task's own number
-    setting: str = "paper"  # PPO's, or "strong"; of Push "wide"
+    setting: str = ""  # paper or strong (CartPole), fast, wide or paper (Fetch); or the first
     algorithm: str = ""  # ddpg or td3; empty for the task's own
     episodes: int = 8  # real episodes that the posterior is inferred from
     simulations: int = 512
-    points: int = 10  # of the grid of each parameter
+    points: int = 10  # of the grid of each parameter, to which the robot is added
     grid_episodes: int = 64  # per point
     real_episodes: int = 256  # at the robot
     short: bool = False
@@ -74,10 +86,10 @@ class Robustness(recipe.Settings):
 def job(settings: Robustness, out: Path) -> dict[str, Any]:
     """Train every policy, score all, compare and draw."""
     logging.getLogger("torchrl").setLevel(logging.WARNING)
+    task = chosen(settings)
     if settings.short:
         settings.simulations, settings.episodes = 24, 2
         settings.grid_episodes, settings.real_episodes = 2, 8
-    task = chosen(settings)
     truth = torch.tensor([task.truth[name] for name in task.prior.names])
     sources = chosen_sources(settings, truth, nominal(task))
     seeds = range(settings.seed, settings.seed + (settings.seeds or default_seeds(task)))
@@ -97,7 +109,7 @@ def job(settings: Robustness, out: Path) -> dict[str, Any]:
         "seeds": len(seeds),
         "frames": int(runs[0]["curve"][-1]["frames"]),
         "real_episodes": runs[0]["real_episodes"],
-        "curves": curves(runs, list(task.prior.names)),
+        "curves": curves(runs, dict(zip(task.prior.names, truth.tolist(), strict=True))),
         "at_real": compared(runs, "at_real"),
         "under_prior": compared(runs, "under_prior"),
         "posteriors": [
@@ -117,11 +129,14 @@ def chosen(settings: Robustness) -> Task:
     if settings.task not in known:
         raise ValueError(message("a task", settings.task, available=known))
     task = known[settings.task]
-    available = ("paper", "wide") if isinstance(task, GoalTask) else PPO_SETTINGS
+    for name, least in COUNTS.items():
+        check_count(f"{name}=", getattr(settings, name), least=least)
+    available = PRESETS if isinstance(task, GoalTask) else tuple(PPO_SETTINGS)
+    settings.setting = settings.setting or available[0]
     if settings.setting not in available:
         raise ValueError(message("a setting", settings.setting, available=available))
     if isinstance(task, GoalTask):
-        task = wide(task) if settings.setting == "wide" else task
+        task = as_preset(task, settings.setting)
         ddpg = dict(task.ddpg) | ({"algorithm": settings.algorithm} if settings.algorithm else {})
         if settings.short:
             ddpg |= {"hidden": (32, 32), "batch_size": 64, "updates_per_frame": 0.02}

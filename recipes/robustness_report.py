@@ -14,19 +14,25 @@ from sim2real_seeds import interval
 from torchrl_bayessim import plots
 
 
-def curves(runs: list[dict[str, Any]], parameters: list[str]) -> list[dict[str, Any]]:
-    """Return the entries ``curves`` of result.json: means and spread over the seeds."""
+def curves(runs: list[dict[str, Any]], robot: dict[str, float]) -> list[dict[str, Any]]:
+    """Return the entries ``curves`` of result.json: means and spread over the seeds.
+
+    Args:
+        runs: One per seed and source.
+        robot: Its value of each parameter, whose own score joins the grid.
+    """
     found = []
     for source in dict.fromkeys(run["source"] for run in runs):
         own = [run for run in runs if run["source"] == source]
-        for name in parameters:
-            scores = torch.tensor([run["grids"][name]["score"] for run in own])
+        for name, truth in robot.items():
+            grid, values = zip(*(_with_robot(run, name, truth) for run in own), strict=True)
+            scores = torch.tensor(values)
             spread = scores.std(0) if len(own) > 1 else torch.zeros(scores.shape[1])
             found.append(
                 {
                     "source": source,
                     "parameter": name,
-                    "grid": own[0]["grids"][name]["grid"],
+                    "grid": grid[0],
                     "return_mean": scores.mean(0).tolist(),
                     "return_sd": spread.tolist(),
                     "seeds": len(own),
@@ -34,6 +40,15 @@ def curves(runs: list[dict[str, Any]], parameters: list[str]) -> list[dict[str, 
                 }
             )
     return found
+
+
+def _with_robot(run: dict[str, Any], name: str, truth: float) -> tuple[list[float], list[float]]:
+    """Return grid and scores along one parameter, with what the policy scores at the robot."""
+    points = dict(zip(run["grids"][name]["grid"], run["grids"][name]["score"], strict=True))
+    near = [value for value in points if math.isclose(value, truth, rel_tol=1e-5)]
+    points = {value: score for value, score in points.items() if value not in near}
+    points[truth] = run["at_real"]  # of more episodes than a point of the grid
+    return [list(column) for column in zip(*sorted(points.items()), strict=True)]  # pyright: ignore
 
 
 def compared(runs: list[dict[str, Any]], where: str) -> dict[str, Any]:
@@ -79,8 +94,9 @@ def table(result: dict[str, Any]) -> str:
         elsewhere = result["under_prior"][source]
         solved = [run["solved"] for run in result["runs"] if run["source"] == source]
         when = ", ".join("never" if at is None else f"{at['frames']:,.0f}" for at in solved)
-        other = f"{_with_interval(elsewhere)}: {_each(elsewhere)}"
-        cells = source, _with_interval(entry), spread, _each(entry), other, when
+        share = score == "success" and " minus " not in source
+        other = f"{_with_interval(elsewhere, share=share)}: {_each(elsewhere)}"
+        cells = source, _with_interval(entry, share=share), spread, _each(entry), other, when
         lines.append(f"| {' | '.join(cells)} |")
     told = [run["posterior"] for run in result["posteriors"]]
     if told:
@@ -94,8 +110,12 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _with_interval(entry: dict[str, Any]) -> str:
-    span = "" if entry["low"] is None else f" [{entry['low']:.3g}, {entry['high']:.3g}]"
+def _with_interval(entry: dict[str, Any], *, share: bool) -> str:
+    """Return mean and interval; Student's does not know that a share ends at 0 and 1."""
+    low, high = entry["low"], entry["high"]
+    if share and low is not None:
+        low, high = max(low, 0.0), min(high, 1.0)
+    span = "" if low is None else f" [{low:.3g}, {high:.3g}]"
     return f"{entry['mean']:.3g}{span}"
 
 

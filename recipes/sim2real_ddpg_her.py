@@ -22,7 +22,7 @@ from typing import Any
 
 import recipe
 from collectors import collectors
-from fetch_tasks import FETCH, MEASURED, GoalTask, paper, wide
+from fetch_tasks import FETCH, MEASURED, GoalTask, as_preset
 from rounds import Journal, compare, describe, draw_pictures, sentence, shown
 from scipy.stats import binomtest
 from tasks import true_parameters
@@ -32,6 +32,7 @@ from video import record
 
 from torchrl_bayessim import checkpoint
 from torchrl_bayessim.agents.ddpg import DDPG
+from torchrl_bayessim.counts import check_count
 from torchrl_bayessim.errors import message
 from torchrl_bayessim.evaluation import successes
 from torchrl_bayessim.inference.refinement import PosteriorRefinement
@@ -42,8 +43,6 @@ from torchrl_bayessim.robots import SurrogateRobot
 from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.summaries import SummaryStatistics
 from torchrl_bayessim.transforms import DomainRandomizer
-
-PRESETS = ("fast", "wide", "paper")
 
 
 @dataclass
@@ -117,13 +116,11 @@ def chosen(settings: Sim2RealFetch) -> GoalTask:
     """Return the task as the settings have it."""
     if settings.task not in FETCH:
         raise ValueError(message("a task", settings.task, available=FETCH))
-    if settings.preset not in PRESETS:
-        raise ValueError(message("a preset", settings.preset, available=PRESETS))
-    task = FETCH[settings.task]
-    if settings.preset == "paper":
-        task = paper(task, settings.rounds)
-    elif settings.preset == "wide":
-        task = wide(task)
+    for name in ("warmup", "updates"):
+        check_count(f"batches, {name}=", getattr(settings, name), least=0)
+    for name in ("rounds", "episodes", "simulations"):
+        check_count(f"{name}=", getattr(settings, name))
+    task = as_preset(FETCH[settings.task], settings.preset, rounds=settings.rounds)
     ddpg = dict(task.ddpg)
     if settings.algorithm:
         ddpg["algorithm"] = settings.algorithm

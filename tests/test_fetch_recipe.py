@@ -119,6 +119,8 @@ def test_a_finished_run_resumes_to_the_same_result(finished, run):
     ("arguments", "said"),
     [
         ("task=fetch_pusk", "got 'fetch_pusk'. Available: fetch_push (did you mean this?)"),
+        ("warmup=-3", "expected batches, warmup= not to be negative, got -3"),
+        ("episodes=0", "expected episodes= to be positive, got 0"),
         ("preset=papr", "got 'papr'. Available: paper (did you mean this?)"),
         ("algorithm=td4", "got 'td4'. Available: td3 (did you mean this?)"),
         ("truth=true", "expected a truth, got 'True'"),

@@ -66,4 +66,3 @@ def test_push_makes_a_fifth_of_the_multiplications_of_its_wide_preset(fetch_task
     frames = {t.budget * t.environments * t.horizon for t in (task, wide)}
     assert frames == {480_000}
     assert {t.warmup * t.environments for t in (task, wide)} == {4000}
-    assert fetch_tasks.wide(fetch_tasks.FETCH["fetch_slide"]).ddpg["algorithm"] == "td3"

@@ -45,8 +45,9 @@ def test_curves_and_paired_differences_are_there(finished):
     assert {"task", "curves", "at_real"} <= result.keys()
     assert [curve["source"] for curve in result["curves"]] == ["prior", "posterior", "oracle"]
     for curve in result["curves"]:
-        assert curve["grid"] == pytest.approx([10, 105, 200])
-        assert len(curve["return_mean"]) == len(curve["return_sd"]) == 3
+        assert curve["grid"] == pytest.approx([10, 50, 105, 200])  # with the robot's own
+        assert len(curve["return_mean"]) == len(curve["return_sd"]) == 4
+        assert curve["return_mean"][1] == pytest.approx(result["at_real"][curve["source"]]["mean"])
         assert all(0 <= mean <= 1 for mean in curve["return_mean"])
         assert curve["seeds"] == 2
     assert result["under_prior"].keys() == result["at_real"].keys()
@@ -54,6 +55,8 @@ def test_curves_and_paired_differences_are_there(finished):
     pairs = zip(real["posterior"]["values"], real["prior"]["values"], strict=True)
     assert real["posterior minus prior"]["values"] == pytest.approx([a - b for a, b in pairs])
     assert {"provenance", "posteriors"} <= result.keys()
+    assert result["setting"] == "fast"
+    assert all(f"out={finished}" in run["provenance"]["command"] for run in result["runs"])
     kept = {f"{source}_policy.pt" for source in ("prior", "posterior", "oracle")}
     assert {path.name for path in finished.glob("seed1/*.pt")} == kept | {"posterior_state.pt"}
     assert "| posterior minus prior |" in (finished / "table.md").read_text()
@@ -76,7 +79,17 @@ def test_finished_policies_are_not_trained_again(finished, run, capsys):
         (["sources=posterior"], "expected the prior among the sources"),
         (["algorithm=td3"], "expected an algorithm for Fetch tasks only, got 'td3'"),
         (["setting=weak"], "expected a setting, got 'weak'. Available: paper, strong"),
-        (["task=fetch_push", "setting=strong"], "got 'strong'. Available: paper, wide"),
+        (["task=fetch_push", "setting=strong"], "got 'strong'. Available: fast, wide, paper"),
+        (
+            ["task=fetch_slide", "setting=wide"],
+            "that changes something, got 'wide on FetchSlide",
+        ),
+        (["real_episodes=0"], "expected real_episodes= to be positive, got 0"),
+        (["episodes=0"], "expected episodes= to be positive, got 0"),
+        (["simulations=1"], "expected at least 8 simulations=, got 1"),
+        (["points=-1"], "expected points= to be positive, got -1"),
+        (["seeds=-1"], "expected seeds= not to be negative, got -1"),
+        (["task=fetch_push", "batches=-1"], "expected batches= not to be negative, got -1"),
     ],
 )
 def test_bad_settings_are_explained(arguments, said, run, tmp_path, capsys):  # noqa: PLR0917
@@ -84,6 +97,28 @@ def test_bad_settings_are_explained(arguments, said, run, tmp_path, capsys):  # 
         run("short=true", *arguments, f"out={tmp_path}")
     (line,) = [x for x in capsys.readouterr().err.splitlines() if x.startswith("robustness")]
     assert said in line
+
+
+def test_the_robot_replaces_a_point_of_the_grid_that_is_its_own(run):
+    import robustness_report
+
+    grids = {"a": {"grid": [0.1, 0.2, 0.30000001], "score": [1.0, 2.0, 3.0]}}
+    (curve,) = robustness_report.curves(
+        [{"source": "prior", "grids": grids, "at_real": 9.0}], {"a": 0.3}
+    )
+    assert curve["grid"] == [0.1, 0.2, 0.3]
+    assert curve["return_mean"] == [1.0, 2.0, 9.0]
+
+
+@pytest.mark.parametrize(("score", "told"), [("success", "0.9 [0.8, 1]"), ("return", "[0.8, 1.2]")])
+def test_intervals_of_shares_end_at_one(run, score, told):
+    import robustness_report
+
+    entry = {"mean": 0.9, "low": 0.8, "high": 1.2, "values": [0.9], "sd": 0.1}
+    result = {"task": "t", "algorithm": "a", "seeds": 1, "frames": 1, "score": score, "runs": []}
+    result |= {"real_episodes": 1, "parameters": [], "true": [], "posteriors": []}
+    result |= {"at_real": {"prior": entry}, "under_prior": {"prior": entry}}
+    assert told in robustness_report.table(result)
 
 
 def test_intervals_are_students(run):

@@ -106,7 +106,7 @@ def learning_curves(
     baseline: Mapping[str, float] | None = None,
     marks: Mapping[str, float] | None = None,
 ) -> Figure:
-    """Draw a line per entry of ``curves``, with a band where there are several seeds.
+    """Draw a line per entry of ``curves``, with a band where there are several seeds, and say so.
 
     Args:
         curves: Name to ``(x, y)``: x of shape ``(P,)``, y of shape ``(P,)`` or ``(seeds, P)``. The
@@ -151,7 +151,9 @@ def learning_curves(
     axes.grid(axis="y", color=_LIGHT, lw=0.6)
     if axes.get_xlim()[1] >= 1000:
         _thousands(axes)
-    axes.legend(frameon=False, fontsize=9)
+    several = any(np.atleast_2d(_array(y)).shape[0] > 1 for _, y in curves.values())
+    title = "mean, least and greatest of the seeds" if several else None
+    axes.legend(frameon=False, fontsize=9, title=title, title_fontsize=8)
     return figure
 
 

@@ -6,7 +6,7 @@ steps N environments natively, the other a ``SerialEnv`` of N gymnasium environm
 turns, so ratios are within a run. While the native one steps in a thread of its own the learner
 makes its updates; Python simulators leave it no time. ``collect`` is the loop without its updates,
 ``train`` the whole of it; environment frames per second. Learner and N are those of the recipes'
-task; ``preset=wide`` has larger networks and more updates, as in `fetch_tasks.wide`::
+task; ``preset=wide`` has larger networks and more updates, as in `fetch_tasks`::
 
     python recipes/benchmarks/fetch_training.py [task=fetch_push] [preset=wide] [runs=5]
         [updates=0.2] [n=16] [matmul_precision=medium]
@@ -25,18 +25,20 @@ from typing import Any
 import gymnasium
 import gymnasium_robotics
 import torch
-from measuring import compare, report
+from measuring import compare, options, report
 from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymEnv, SerialEnv, TransformedEnv
 
 from torchrl_bayessim import ApplyPhysics, DomainRandomizer, MujocoPhysics
 from torchrl_bayessim.agents.ddpg import DDPG
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
+from torchrl_bayessim.errors import message
 from torchrl_bayessim.overlapped import Overlapped
 from torchrl_bayessim.randomness import isolated
 from torchrl_bayessim.simulate import make_collector, next_batch
 
 sys.path.append(str(Path(__file__).parent.parent))
-from fetch_tasks import FETCH, FRICTION, GoalTask, wide
+from fetch_tasks import FETCH, FRICTION, PRESETS, GoalTask, as_preset
+from recipe import MATMUL_PRECISIONS
 
 STEPS = 50  # an episode
 GYM = ", gymnasium-robotics"
@@ -82,14 +84,19 @@ def loop(env: EnvBase, learner: DDPG, batches: int) -> Callable[[], int]:
 
 def main(*arguments: str) -> None:
     """Measure both loops in turn, without and with updates."""
-    given = {"task": "fetch_push", "preset": "", "n": "", "runs": "5", "updates": ""}
-    given |= {"threads": "1", "batches": "1", "matmul_precision": "medium"}
-    given |= dict(argument.split("=", 1) for argument in arguments)
-    task = FETCH[given["task"]]
-    if given["preset"] == "wide":
-        task = wide(task)
-    n, threads = int(given["n"] or task.environments), int(given["threads"])
-    batches = int(given["batches"])
+    names = {"task": "fetch_push", "preset": "fast", "matmul_precision": "medium", "updates": ""}
+    rest = [a for a in arguments if a.partition("=")[0] not in names]
+    given = {**names, **dict(a.split("=", 1) for a in arguments if a not in rest)}
+    counts = options(rest, optional=["n"], n=0, runs=5, threads=1, batches=1)
+    for name, available in {
+        "task": FETCH,
+        "preset": PRESETS,
+        "matmul_precision": MATMUL_PRECISIONS,
+    }.items():
+        if given[name] not in available:
+            raise SystemExit(message(f"{name}=", given[name], available=available))
+    task = as_preset(FETCH[given["task"]], given["preset"])
+    n, threads, batches = counts["n"] or task.environments, counts["threads"], counts["batches"]
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore")
     gymnasium.register_envs(gymnasium_robotics)
@@ -97,19 +104,19 @@ def main(*arguments: str) -> None:
     torch.set_float32_matmul_precision(given["matmul_precision"])
     asked = {"updates_per_frame": float(given["updates"])} if given["updates"] else {}
     cases = {}
-    for name, options in {"collect": {"updates_per_frame": 0.0}, "train": asked}.items():
+    for name, own in {"collect": {"updates_per_frame": 0.0}, "train": asked}.items():
         for kind, make in {"": partial(batched, threads=threads), GYM: serial}.items():
             env = make(task, n)
-            learner = task.learner(env, **options)
+            learner = task.learner(env, **own)
             cases[name + kind] = loop(env, learner, batches)
-    rates = compare(cases, runs=int(given["runs"]))
+    rates = compare(cases, runs=counts["runs"])
     for name, values in rates.items():
         other = name + GYM
         against = {other: rates[other]} if other in rates else {}
         context = {"task": task.simulator_name, "n": n, "threads": threads, "seed": 0}
         context |= {"algorithm": learner.name, "updates": learner.updates_per_frame}
         context |= {"hidden": learner.settings["hidden"], "batches": batches}
-        context["matmul_precision"] = given["matmul_precision"]
+        context |= {"preset": given["preset"], "matmul_precision": given["matmul_precision"]}
         report("fetch_training", name, values, against=against, **context)
 
 
