@@ -303,6 +303,12 @@ def test_bad_batches_are_refused(episodes):
         ({"capacity": 63}, ValueError, "replay buffer of at least one batch of 64, got 63"),
         ({"actor_every": 0}, ValueError, "updates per update of the actor.*got 0"),
         ({"critic_keys": ["thetaa"]}, ValueError, r"theta \(did you mean this\?\)"),
+        ({"gamma": 1.0}, ValueError, r"gamma of at least 0 and below 1, got 1\.0"),
+        ({"rewards": (0.0, -1.0)}, ValueError, r"greatest.*Try: rewards=\(-1\.0, 0\.0\)"),
+        ({"rewards": (float("nan"), 0.0)}, ValueError, "a finite least reward, got nan"),
+        ({"rewards": (-1.0, float("nan"))}, ValueError, "a finite greatest reward, got nan"),
+        ({"rewards": (-1.0,)}, ValueError, r"two numbers, got \(-1\.0,\)"),
+        ({"rewards": -1.0}, TypeError, r"two numbers, got 'float'"),
     ],
 )
 def test_impossible_settings_are_refused(options, error, match):

@@ -51,7 +51,7 @@ class DDPG:
         critic_keys: What the critic sees besides, such as the physics parameters ``theta``: it is
             needed in training only, so it may know what the robot cannot (Pinto et al., 2018).
         hidden: Width of each hidden layer of actor and critics.
-        gamma: Discount per step.
+        gamma: Discount per step, below 1: else returns have no bound.
         rewards: Least and greatest reward; targets are clamped to the returns that they allow.
         learning_rate: Of both Adams.
         final_learning_rate: At progress 1; linear from ``decay_from`` on.
@@ -132,8 +132,10 @@ class DDPG:
         check_count("updates per update of the actor", every)
         check_count("transitions of capacity", capacity)
         shares = {"tau": tau, "decay_from": decay_from, "random_share": random_share}
-        for name, value in {**shares, "gamma": gamma}.items():
+        for name, value in shares.items():
             check_number(name, value, least=0.0, most=1.0)
+        check_number("gamma", gamma, least=0.0, below=1.0)
+        _check_rewards(rewards)
         sizes = {"final_learning_rate": final_learning_rate, "action_l2": action_l2, "noise": noise}
         for name, value in {**sizes, "updates_per_frame": updates_per_frame}.items():
             check_number(name, value, least=0.0)
@@ -343,3 +345,15 @@ class DDPG:
         """Return the parameters of networks and target networks, in place."""
         sources = dict(self._loss.named_parameters()) | dict(self._loss.named_buffers())
         return {name: value.data for name, value in sources.items() if "network_params" in name}
+
+
+def _check_rewards(rewards: Any) -> None:
+    expected = "rewards=(least, greatest), two numbers"
+    check_kind(expected, rewards, tuple, list)
+    if len(rewards) != 2:
+        raise ValueError(message(expected, rewards))
+    for name, value in zip(("least reward", "greatest reward"), rewards, strict=True):
+        check_number(name, value)
+    low, high = rewards
+    if low > high:
+        raise ValueError(message(expected, rewards, hint=f"rewards={high, low}"))
