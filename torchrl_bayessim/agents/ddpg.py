@@ -43,7 +43,8 @@ class DDPG:
     Args:
         env: The environment (or one like it) that batches will come from; only its specs are read.
             It observes ``observation``, ``achieved_goal`` and ``desired_goal``.
-        reward: Its reward, a function of the achieved and the desired goal.
+        reward: Its reward, a function of the achieved and the desired goal; compared with the
+            rewards of every batch.
         seed: Seed of the initial parameters and, with the key, of every update.
         algorithm: ``ddpg`` or ``td3`` (two critics, target noise, a delayed actor).
         actor_every: Updates of the critics per update of the actor; None for 1, or 2 of ``td3``.
@@ -193,10 +194,10 @@ class DDPG:
             Means over the updates of the losses; their number; the learning rate.
 
         Raises:
-            ValueError: The batch lacks an entry, its rows are no whole episodes, or the replay
-                buffer holds less than one batch.
-            SimulationError: A value in the batch or a loss is not finite. The networks are then
-                as they were before.
+            ValueError: The batch lacks an entry, its rows are no whole episodes, its rewards are
+                not those of ``reward``, or the replay buffer holds less than one batch.
+            SimulationError: A value in the batch, a loss or a parameter is not finite. The networks
+                are then as they were before.
         """
         self.begin(batch, key=key, progress=progress)
         return self.finish()
@@ -210,7 +211,7 @@ class DDPG:
         """
         self.finish()
         self._check(batch)
-        kept = batch.select(*self.kept_keys)
+        kept = batch.select(*self.kept_keys).detach()  # actions may come with the policy's graph
         before = copy.deepcopy(self._learned())
         self.buffer.extend(kept)
         if len(self.buffer) < self.batch_size:
@@ -246,6 +247,7 @@ class DDPG:
         (owed, before), self._owed = self._owed, None
         try:
             owed.finish()
+            self._check_learned()
         except SimulationError:
             self._learn(before)
             raise
@@ -263,6 +265,23 @@ class DDPG:
                 raise SimulationError(
                     message(f"finite {key!r} in the batch", "NaN or infinity in some frames")
                 )
+
+    def _check_learned(self) -> None:
+        """Refuse what no loss has seen: the gradient of a part's last update may not be finite."""
+        moments = [
+            tensor
+            for optimizer in self._optimizers.values()
+            for state in optimizer.state.values()
+            for tensor in state.values()
+        ]  # infinite ones leave parameters finite, and never again move them
+        if not all(tensor.isfinite().all() for tensor in [*self._tensors().values(), *moments]):
+            raise SimulationError(
+                message(
+                    "finite parameters after the updates",
+                    "NaN or infinity",
+                    hint="a smaller learning rate, or rewards within the given range",
+                )
+            )
 
     @property
     def kept_keys(self) -> list[Any]:
