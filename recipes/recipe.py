@@ -21,6 +21,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import kept_json
 import torch
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -280,7 +281,7 @@ def kept(path: Path, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Return what a part of a run gave: from its file, or from ``work()``, which is then kept."""
     if not path.exists():
         write_text(path, json.dumps(plain(work())))
-    return json.loads(path.read_text())
+    return kept_json.read(path, dict, hint="delete the file, and the part is done again")
 
 
 def plain(value: Any) -> Any:

@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import kept_json
 import recipe
 import torch
 from tasks import Task
@@ -19,6 +20,8 @@ from torchrl_bayessim.loop import Round
 from torchrl_bayessim.sources import draw
 from torchrl_bayessim.whole_file import write_text
 
+_ANEW = "begin the run anew in another folder, as its earlier rounds are told nowhere else"
+
 
 class Journal:
     """What each round gave, kept beside the checkpoint so that a resumed run reports them all.
@@ -26,6 +29,9 @@ class Journal:
     A logger, if there is one, is told everything again: it begins anew in every process. Over the
     frames of training it gets ``train/*``, and each round ``posterior/NAME``, ``posterior/NAME_sd``
     of the parameters' ``names``, and ``real/return``.
+
+    Raises:
+        ValueError: The file of the run to resume is damaged.
     """
 
     def __init__(
@@ -38,7 +44,9 @@ class Journal:
     ) -> None:
         self.path, self.logger, self.names = path, logger, names
         resume = resume and path.exists()  # not before the end of the first round
-        self.rounds: list[dict[str, Any]] = json.loads(path.read_text()) if resume else []
+        self.rounds: list[dict[str, Any]] = (
+            kept_json.read(path, list, entries=dict, hint=_ANEW) if resume else []
+        )
         for entry in self.rounds:
             self._log(entry)
 

@@ -18,6 +18,7 @@ from typing import Any
 from tqdm.auto import tqdm
 
 from torchrl_bayessim import checkpoint
+from torchrl_bayessim.errors import message
 from torchrl_bayessim.loop import ended_return
 from torchrl_bayessim.overlapped import Overlapped
 from torchrl_bayessim.randomness import isolated, seed_from
@@ -74,7 +75,8 @@ def train(
     """Train, from the checkpoint where there is one.
 
     Args:
-        learner: Such as `DDPG` or `PPO`; it holds the last policy afterwards, not the best.
+        learner: Such as `DDPG` or `PPO`; it holds the last policy afterwards, not the best. If it
+            has ``settings``, as a loop's may, a checkpoint of others is refused.
         env: With ``randomizer`` among its transforms, whose source is what it trains under.
         randomizer: Its episodes are part of checkpoints.
         plan: How long, and what on the way.
@@ -82,12 +84,21 @@ def train(
         score: Gives a policy a number to be chosen by.
         label: Of the progress bar.
         progress: Whether to show one.
+
+    Raises:
+        ValueError: The checkpoint is damaged, or of another training: of another key, or of a
+            learner with other settings or networks.
     """
+    made_by = {"settings": dict(getattr(learner, "settings", {})), "key": list(key)}
     state: dict[str, Any] = {"batch": 0, "curve": [], "best": {}, "best_score": -float("inf")}
     if plan.file is not None and plan.file.exists():
         state = checkpoint.load(plan.file)
-        learner.load_state_dict(state["learner"])
-        randomizer.set_extra_state(dict(state["randomizer"]))
+        _check_made_by(made_by, state, plan.file)
+        try:
+            learner.load_state_dict(state["learner"])
+            randomizer.set_extra_state(dict(state["randomizer"]))
+        except (RuntimeError, KeyError) as error:  # which torch says of networks of other sizes
+            raise ValueError(_another("this learner's networks", str(error), plan.file)) from error
     begun = randomizer.get_extra_state()
     collector = make_collector(env, learner.policy, steps=plan.horizon)
     randomizer.set_extra_state(begun)  # making a collector resets once
@@ -97,11 +108,27 @@ def train(
             _chunk(learner, collector, plan, state, key=key, score=score, bar=bar)
             if plan.file is not None:
                 kept = {"learner": learner.state_dict(), "randomizer": randomizer.get_extra_state()}
-                checkpoint.save(plan.file, state | kept)
+                checkpoint.save(plan.file, state | kept | made_by)
     finally:
         bar.close()
         collector.shutdown(close_env=False)
     return Trained(state["curve"], state["best"] or _weights(learner))
+
+
+def _check_made_by(made_by: dict[str, Any], state: dict[str, Any], file: Path) -> None:
+    """Refuse the checkpoint of another training; older ones, which do not say, are let pass."""
+    key, settings = made_by["key"], made_by["settings"]
+    if state.get("key", key) != key:
+        raise ValueError(_another(f"key={tuple(key)}", tuple(state["key"]), file))
+    found = state.get("settings", settings)
+    for name in settings | found:
+        if settings.get(name) != found.get(name):
+            raise ValueError(_another(f"{name}={settings.get(name)!r}", found.get(name), file))
+
+
+def _another(expected: str, got: object, file: Path) -> str:
+    hint = "the settings of the run that wrote it, another folder, or delete the file"
+    return message(f"a checkpoint {file} made with {expected}", got, hint=hint)
 
 
 def _chunk(

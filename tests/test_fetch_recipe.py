@@ -183,6 +183,40 @@ def test_training_goes_on_from_its_checkpoint_to_the_same_numbers(recipes, tmp_p
     assert not all(torch.equal(v, learner.policy.state_dict()[n]) for n, v in whole.best.items())
 
 
+def test_a_checkpoint_of_another_training_is_refused(recipes, tmp_path):
+    from fetch_tasks import FETCH
+    from training import Plan, train
+
+    from torchrl_bayessim import checkpoint
+    from torchrl_bayessim.transforms import DomainRandomizer
+
+    task, file = FETCH["fetch_reach"], tmp_path / "kept.pt"
+
+    def trained(key=(0,), **options):
+        randomizer = DomainRandomizer(task.prior)
+        env = task.make(2, seed=0, randomizer=randomizer)
+        small = {"hidden": (16,), "batch_size": 32, "updates_per_frame": 0.02, **options}
+        learner = task.learner(env, seed=0, **small)
+        plan = Plan(1, task.horizon, file=file)
+        return train(learner, env, randomizer, plan, key=key, progress=False).curve
+
+    curve = trained()
+    assert trained() == curve
+    for options, match in (
+        ({"gamma": 0.9}, r"kept\.pt made with gamma=0\.9, got 0\.98\. Try: the settings"),
+        ({"hidden": (8,)}, r"kept\.pt made with hidden=\[8\], got \[16\]"),
+        ({"key": (1,)}, r"kept\.pt made with key=\(1,\), got \(0,\)"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            trained(**options)
+    older = checkpoint.load(file)
+    del older["settings"], older["key"]
+    checkpoint.save(file, older)
+    assert trained(gamma=0.9) == curve
+    with pytest.raises(ValueError, match=r"kept\.pt made with this learner's networks, got.*size"):
+        trained(hidden=(8,))
+
+
 def test_a_thinned_curve_has_means_and_carries_them_over_long_episodes(recipes):
     from training import first_solved, thinned
 

@@ -54,6 +54,13 @@ def test_a_resumed_journal_logs_every_round_once(journal, tmp_path):
     assert anew.rounds == []
 
 
+@pytest.mark.parametrize("content", ['[{"round": 1', "", "{}", "[1]"])
+def test_a_damaged_journal_is_named(content, journal, tmp_path):
+    (tmp_path / "rounds.json").write_text(content)
+    with pytest.raises(ValueError, match=r"a list in JSON.*rounds\.json: .*anew in another folder"):
+        journal("damaged", resume=True)
+
+
 def test_tensorboard_is_told_the_same(journal, tmp_path):
     pytest.importorskip("tensorboard")
     from rounds import Journal

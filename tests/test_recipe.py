@@ -337,6 +337,16 @@ def test_a_part_that_is_kept_is_not_done_again(tmp_path, monkeypatch):
     assert done == ["once"]
 
 
+@pytest.mark.parametrize("content", [b'{"mean": 1', b"", b"[1]", b"\xff\xfe", b"[" * 10**5])
+def test_a_part_that_is_damaged_is_named(content, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(RECIPE.parent)
+    from recipe import kept
+
+    (tmp_path / "seed1.json").write_bytes(content)
+    with pytest.raises(ValueError, match=r"an object in JSON.*seed1\.json: .*Try: delete the file"):
+        kept(tmp_path / "seed1.json", dict)
+
+
 def test_workers_calculate_as_the_recipe_does(monkeypatch):
     monkeypatch.syspath_prepend(RECIPE.parent)
     import torch

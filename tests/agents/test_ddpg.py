@@ -283,6 +283,52 @@ def test_a_critic_that_is_nan_stops_the_training(episodes):
     assert not changed(before, {n: learner._tensors()[n] for n in before})
 
 
+@pytest.mark.parametrize(
+    ("part", "gradient"), [("actor", torch.nan), ("critic", torch.nan), ("critic", 1e30)]
+)
+def test_a_gradient_that_is_not_finite_at_last_is_told_and_undone(episodes, part, gradient):
+    every = 10 if part == "actor" else 9  # once in ten updates, and no loss after the last one
+    learner = DDPG(push(), goal_reward, actor_every=every, **SMALL)
+    learner.update(episodes, key=(0,))
+    before = {name: value.clone() for name, value in learner._tensors().items()}
+    adam, made = learner._optimizers[part], []
+
+    def spoil(*_):
+        made.append(part)
+        if len(made) == (1 if part == "actor" else 10):
+            learner._parameters(part)[0].grad[0, 0] = gradient
+
+    hook = adam.register_step_pre_hook(spoil)
+    with pytest.raises(SimulationError, match=r"finite parameters after the.*Try: a smaller"):
+        learner.update(episodes, key=(1,))
+    hook.remove()
+    assert not changed(before, learner._tensors())
+    assert learner.update(episodes, key=(1,))["updates"] == 10
+
+
+def test_a_batch_may_come_with_the_policys_graph():
+    env = push()
+    learner = DDPG(env, goal_reward, **SMALL)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        batch = env.rollout(50, learner.policy, break_when_any_done=False)
+    assert batch["action"].requires_grad
+    assert learner.update(batch, key=(0,))["updates"] == 10
+    assert not any(value.requires_grad for value in learner.buffer.contents()["entries"].values())
+
+
+def test_a_reward_that_is_not_the_environments_is_refused(episodes):
+    def dense(achieved, desired):
+        return goal_reward(achieved, desired, dense=True)
+
+    learner = DDPG(push(), dense, **SMALL)
+    before = {name: value.clone() for name, value in learner._tensors().items()}
+    with pytest.raises(ValueError, match="the environment's own reward, -1 for a transition, got"):
+        learner.update(episodes, key=(0,))
+    assert len(learner.buffer) == 0
+    assert not changed(before, learner._tensors())
+    assert learner.finish() == {}
+
+
 def test_bad_batches_are_refused(episodes):
     learner = DDPG(push(), goal_reward, **SMALL)
     broken = episodes.clone()
@@ -303,6 +349,12 @@ def test_bad_batches_are_refused(episodes):
         ({"capacity": 63}, ValueError, "replay buffer of at least one batch of 64, got 63"),
         ({"actor_every": 0}, ValueError, "updates per update of the actor.*got 0"),
         ({"critic_keys": ["thetaa"]}, ValueError, r"theta \(did you mean this\?\)"),
+        ({"gamma": 1.0}, ValueError, r"gamma of at least 0 and below 1, got 1\.0"),
+        ({"rewards": (0.0, -1.0)}, ValueError, r"greatest.*Try: rewards=\(-1\.0, 0\.0\)"),
+        ({"rewards": (float("nan"), 0.0)}, ValueError, "a finite least reward, got nan"),
+        ({"rewards": (-1.0, float("nan"))}, ValueError, "a finite greatest reward, got nan"),
+        ({"rewards": (-1.0,)}, ValueError, r"two numbers, got \(-1\.0,\)"),
+        ({"rewards": -1.0}, TypeError, r"two numbers, got 'float'"),
     ],
 )
 def test_impossible_settings_are_refused(options, error, match):

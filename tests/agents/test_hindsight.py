@@ -146,6 +146,39 @@ def test_unfinished_episodes_are_refused():
         buffer.extend(tagged(0, lengths=(101,)))
 
 
+def far(achieved, desired):
+    return -near(achieved, desired)
+
+
+@pytest.mark.parametrize(
+    ("reward", "match"),
+    [
+        (far, r"own reward, -1 for a transition, got '1; 10 of 10 differ'.*Try: a reward"),
+        (lambda a, d: -(a - d).norm(dim=-1), "10 of 10 differ"),
+        (lambda a, d: near(a, d) * torch.nan, "got 'nan; 10 of 10 differ'"),
+        (lambda a, d: near(a, d).mean(), r"tensor of shape \(2, 5\), got \(\)"),
+        (lambda a, d: a - d, r"a reward for each transition.*got \(2, 5, 2\)"),
+        (lambda a, d: -1.0, "a reward for each transition.*got 'float'"),
+    ],
+)
+def test_a_reward_that_is_not_the_environments_is_refused(reward, match):
+    buffer = HindsightReplayBuffer(reward, capacity=100)
+    with pytest.raises(ValueError, match=match):
+        buffer.extend(tagged(0, lengths=(5,), rows=2))
+    assert len(buffer) == 0
+
+
+def test_a_reward_may_have_a_column_or_differ_where_a_goal_lies_at_the_threshold():
+    episodes = tagged(0, lengths=(10,), rows=20)
+    buffer = HindsightReplayBuffer(lambda a, d: near(a, d).unsqueeze(-1), capacity=1000)
+    episodes["next", "reward"][0, :2] = 0.0
+    buffer.extend(episodes)
+    assert buffer.sample(10)["next", "reward"].shape == (10, 1)
+    episodes["next", "reward"][0, 2] = 0.0
+    with pytest.raises(ValueError, match="own reward, 0 for a transition, got '-1; 3 of 200 diff"):
+        buffer.extend(episodes)
+
+
 @pytest.mark.parametrize(
     ("options", "match"),
     [

@@ -43,7 +43,8 @@ class DDPG:
     Args:
         env: The environment (or one like it) that batches will come from; only its specs are read.
             It observes ``observation``, ``achieved_goal`` and ``desired_goal``.
-        reward: Its reward, a function of the achieved and the desired goal.
+        reward: Its reward, a function of the achieved and the desired goal; compared with the
+            rewards of every batch.
         seed: Seed of the initial parameters and, with the key, of every update.
         algorithm: ``ddpg`` or ``td3`` (two critics, target noise, a delayed actor).
         actor_every: Updates of the critics per update of the actor; None for 1, or 2 of ``td3``.
@@ -51,7 +52,7 @@ class DDPG:
         critic_keys: What the critic sees besides, such as the physics parameters ``theta``: it is
             needed in training only, so it may know what the robot cannot (Pinto et al., 2018).
         hidden: Width of each hidden layer of actor and critics.
-        gamma: Discount per step.
+        gamma: Discount per step, below 1: else returns have no bound.
         rewards: Least and greatest reward; targets are clamped to the returns that they allow.
         learning_rate: Of both Adams.
         final_learning_rate: At progress 1; linear from ``decay_from`` on.
@@ -132,8 +133,10 @@ class DDPG:
         check_count("updates per update of the actor", every)
         check_count("transitions of capacity", capacity)
         shares = {"tau": tau, "decay_from": decay_from, "random_share": random_share}
-        for name, value in {**shares, "gamma": gamma}.items():
+        for name, value in shares.items():
             check_number(name, value, least=0.0, most=1.0)
+        check_number("gamma", gamma, least=0.0, below=1.0)
+        _check_rewards(rewards)
         sizes = {"final_learning_rate": final_learning_rate, "action_l2": action_l2, "noise": noise}
         for name, value in {**sizes, "updates_per_frame": updates_per_frame}.items():
             check_number(name, value, least=0.0)
@@ -191,10 +194,10 @@ class DDPG:
             Means over the updates of the losses; their number; the learning rate.
 
         Raises:
-            ValueError: The batch lacks an entry, its rows are no whole episodes, or the replay
-                buffer holds less than one batch.
-            SimulationError: A value in the batch or a loss is not finite. The networks are then
-                as they were before.
+            ValueError: The batch lacks an entry, its rows are no whole episodes, its rewards are
+                not those of ``reward``, or the replay buffer holds less than one batch.
+            SimulationError: A value in the batch, a loss or a parameter is not finite. The networks
+                are then as they were before.
         """
         self.begin(batch, key=key, progress=progress)
         return self.finish()
@@ -208,7 +211,7 @@ class DDPG:
         """
         self.finish()
         self._check(batch)
-        kept = batch.select(*self.kept_keys)
+        kept = batch.select(*self.kept_keys).detach()  # actions may come with the policy's graph
         before = copy.deepcopy(self._learned())
         self.buffer.extend(kept)
         if len(self.buffer) < self.batch_size:
@@ -244,6 +247,7 @@ class DDPG:
         (owed, before), self._owed = self._owed, None
         try:
             owed.finish()
+            self._check_learned()
         except SimulationError:
             self._learn(before)
             raise
@@ -261,6 +265,23 @@ class DDPG:
                 raise SimulationError(
                     message(f"finite {key!r} in the batch", "NaN or infinity in some frames")
                 )
+
+    def _check_learned(self) -> None:
+        """Refuse what no loss has seen: the gradient of a part's last update may not be finite."""
+        moments = [
+            tensor
+            for optimizer in self._optimizers.values()
+            for state in optimizer.state.values()
+            for tensor in state.values()
+        ]  # infinite ones leave parameters finite, and never again move them
+        if not all(tensor.isfinite().all() for tensor in [*self._tensors().values(), *moments]):
+            raise SimulationError(
+                message(
+                    "finite parameters after the updates",
+                    "NaN or infinity",
+                    hint="a smaller learning rate, or rewards within the given range",
+                )
+            )
 
     @property
     def kept_keys(self) -> list[Any]:
@@ -343,3 +364,15 @@ class DDPG:
         """Return the parameters of networks and target networks, in place."""
         sources = dict(self._loss.named_parameters()) | dict(self._loss.named_buffers())
         return {name: value.data for name, value in sources.items() if "network_params" in name}
+
+
+def _check_rewards(rewards: Any) -> None:
+    expected = "rewards=(least, greatest), two numbers"
+    check_kind(expected, rewards, tuple, list)
+    if len(rewards) != 2:
+        raise ValueError(message(expected, rewards))
+    for name, value in zip(("least reward", "greatest reward"), rewards, strict=True):
+        check_number(name, value)
+    low, high = rewards
+    if low > high:
+        raise ValueError(message(expected, rewards, hint=f"rewards={high, low}"))

@@ -29,6 +29,7 @@ GoalReward = Callable[[Tensor, Tensor], Tensor]
 """``(achieved (*, G), desired (*, G)) -> reward (*,)``, the environment's own."""
 
 _FOLLOWING, _MOVES = "following", "moves"
+_NOISE = 0.01  # share of the greatest reward, and of transitions: what noisy sensors may change
 
 
 class HindsightReplayBuffer(HERReplayBuffer):
@@ -78,11 +79,11 @@ class HindsightReplayBuffer(HERReplayBuffer):
         check_function("a reward, a function of the achieved and the desired goal", reward)
         if moving is not None:
             check_number("distance moved", moving, least=0.0)
-        self.capacity, self.moving = capacity, moving
+        self.capacity, self.moving, self._reward = capacity, moving, reward
 
         def relabelled(sample: TensorDictBase) -> Tensor:
-            value = reward(sample["next", "achieved_goal"], sample["desired_goal"])
-            return value.unsqueeze(-1).to(sample["next", "reward"].dtype)
+            own = sample["next", "reward"]
+            return _rewards(reward, sample).reshape(own.shape).to(own.dtype)
 
         super().__init__(
             relabelled,
@@ -100,7 +101,9 @@ class HindsightReplayBuffer(HERReplayBuffer):
             episodes: Batch size ``[N, T]``; each row one or several episodes, the last one ended.
 
         Raises:
-            ValueError: A row ends within an episode, or holds more than fits.
+            ValueError: A row ends within an episode, or holds more than fits. The function of the
+                reward gives another one than the environment in over 1 % of the transitions, or
+                not one for each.
         """
         done = episodes["next", "done"].reshape(episodes.batch_size)
         if episodes.ndim != 2 or not done[:, -1].all():
@@ -114,6 +117,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
             )
         if done.numel() > self.capacity:
             raise ValueError(message(f"at most {self.capacity} transitions at once", done.numel()))
+        _check_reward(self._reward, episodes)
         end = _end_of_episode(done)
         time = torch.arange(done.shape[1])
         final = episodes["next", "achieved_goal"].gather(
@@ -176,6 +180,39 @@ class _MovingFirst(Sampler):
         return {}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None: ...
+
+
+def _rewards(reward: GoalReward, steps: TensorDictBase) -> Tensor:
+    with torch.no_grad():
+        return reward(steps["next", "achieved_goal"], steps["desired_goal"])
+
+
+def _check_reward(reward: GoalReward, episodes: TensorDictBase) -> None:
+    """Refuse a reward that is not the environment's: relabelled transitions would not fit others.
+
+    It may differ in a few, where rounding or a sensor's noise carries a goal over a threshold.
+    """
+    own = episodes.get(("next", "reward"), None)
+    if own is None:
+        return
+    found, shape = _rewards(reward, episodes), tuple(episodes.batch_size)
+    sizes = shape, (*shape, 1)
+    if not isinstance(found, Tensor) or found.shape not in sizes:
+        got = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
+        raise ValueError(message(f"a reward for each transition, a tensor of shape {shape}", got))
+    own, found = own.reshape(-1).double(), found.reshape(-1).double()
+    near = torch.isclose(found, own, rtol=0.0, atol=_NOISE * own.abs().max().item() + 1e-6)
+    far = (~near).nonzero().flatten()
+    if len(far) > _NOISE * len(own):
+        first = far[0]
+        raise ValueError(
+            message(
+                f"the environment's own reward, {own[first]:g} for a transition",
+                f"{found[first]:g}; {len(far)} of {len(own)} differ",
+                hint="a reward(achieved_goal, desired_goal) with the environment's sign and "
+                "threshold, sparse where the environment's is sparse",
+            )
+        )
 
 
 def _end_of_episode(done: Tensor) -> Tensor:
