@@ -29,7 +29,8 @@ GoalReward = Callable[[Tensor, Tensor], Tensor]
 """``(achieved (*, G), desired (*, G)) -> reward (*,)``, the environment's own."""
 
 _FOLLOWING, _MOVES = "following", "moves"
-_NOISE = 0.01  # share of the greatest reward, and of transitions: what noisy sensors may change
+_ROUNDING = 0.01  # share of the greatest reward
+_OVER = 0.1  # share of the transitions that a sensor's noise or offset may carry over a threshold
 
 
 class HindsightReplayBuffer(HERReplayBuffer):
@@ -102,7 +103,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
 
         Raises:
             ValueError: A row ends within an episode, or holds more than fits. The function of the
-                reward gives another one than the environment in over 1 % of the transitions, or
+                reward gives another one than the environment in a tenth of the transitions, or
                 not one for each.
         """
         done = episodes["next", "done"].reshape(episodes.batch_size)
@@ -190,7 +191,7 @@ def _rewards(reward: GoalReward, steps: TensorDictBase) -> Tensor:
 def _check_reward(reward: GoalReward, episodes: TensorDictBase) -> None:
     """Refuse a reward that is not the environment's: relabelled transitions would not fit others.
 
-    It may differ in a few, where rounding or a sensor's noise carries a goal over a threshold.
+    It may differ in some, where rounding or a sensor carries a goal over a threshold.
     """
     own = episodes.get(("next", "reward"), None)
     if own is None:
@@ -201,9 +202,9 @@ def _check_reward(reward: GoalReward, episodes: TensorDictBase) -> None:
         got = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
         raise ValueError(message(f"a reward for each transition, a tensor of shape {shape}", got))
     own, found = own.reshape(-1).double(), found.reshape(-1).double()
-    near = torch.isclose(found, own, rtol=0.0, atol=_NOISE * own.abs().max().item() + 1e-6)
+    near = torch.isclose(found, own, rtol=0.0, atol=_ROUNDING * own.abs().max().item() + 1e-6)
     far = (~near).nonzero().flatten()
-    if len(far) > _NOISE * len(own):
+    if len(far) > _OVER * len(own):
         first = far[0]
         raise ValueError(
             message(
