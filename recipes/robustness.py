@@ -30,6 +30,7 @@ from robustness_report import compared, curves, draw_pictures, table
 from robustness_study import Study, nominal
 from tasks import TASKS, Task
 from torch import Tensor
+from tqdm.auto import tqdm
 
 from torchrl_bayessim.counts import check_count
 from torchrl_bayessim.errors import message
@@ -94,11 +95,14 @@ def job(settings: Robustness, out: Path) -> dict[str, Any]:
     sources = chosen_sources(settings, truth, nominal(task))
     seeds = range(settings.seed, settings.seed + (settings.seeds or default_seeds(task)))
     runs: list[dict[str, Any]] = []
-    for seed in seeds:
-        study = Study(task, truth, settings, out / f"seed{seed}", seed=seed)
-        for source in sources:
-            runs.append({"source": source, "seed": seed, **study.scored(source)})
-            print(f"seed {seed}, {source}: {runs[-1]['at_real']:.2f} at the robot")
+    total = len(seeds) * len(sources)
+    with tqdm(total=total, desc="policies", disable=not settings.progress) as bar:
+        for seed in seeds:
+            study = Study(task, truth, settings, out / f"seed{seed}", seed=seed)
+            for source in sources:
+                runs.append({"source": source, "seed": seed, **study.scored(source)})
+                bar.update()
+                bar.write(f"seed {seed}, {source}: {runs[-1]['at_real']:.2f} at the robot")
     result = {
         "task": settings.task,
         "algorithm": study.algorithm,

@@ -102,7 +102,8 @@ def train(
     begun = randomizer.get_extra_state()
     collector = make_collector(env, learner.policy, steps=plan.horizon)
     randomizer.set_extra_state(begun)  # making a collector resets once
-    bar = tqdm(total=plan.batches, initial=state["batch"], desc=label, disable=not progress)
+    done = state["batch"]
+    bar = tqdm(total=plan.batches, initial=done, desc=label, disable=not progress, leave=False)
     try:
         while state["batch"] < plan.batches:
             _chunk(learner, collector, plan, state, key=key, score=score, bar=bar)
