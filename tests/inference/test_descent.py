@@ -68,6 +68,20 @@ def test_overfitting_ends_it_by_itself_but_not_before_the_box():
     assert len(mean) == max(best + 1, min(best + 1 + 25, 36)) + 7  # the box, then 12 % of 60 epochs
 
 
+def test_without_a_box_it_is_as_patient_until_the_last_part():
+    """Nothing to learn, so that the held-out loss wavers: a few epochs in vain are no end."""
+    prior = GaussianPrior({"a": (0.0, 1.0)})
+    theta = prior.sample((400,), generator=generator(2))
+    noise = torch.randn(400, 2, generator=generator(3))
+    data = TensorDict({"theta": theta, "summary": noise}, [400])
+    net = MixtureDensityPosterior(prior, 2, components=1)
+    own = {"patience": None, "lr": 3e-2}
+    ((_, losses),) = descend([net], data[:200], data[200:], epochs=40, **OPTIONS | own)
+    best = losses.index(min(losses))
+    assert len(losses) == max(best + 1, min(best + 1 + 25, 24)) + 5
+    assert best + 6 < 24  # five epochs in vain, long before
+
+
 def test_the_box_comes_in_before_the_end():
     """Summaries that say nothing: the posterior is flat to its edges, the entropy 0."""
     prior = BoxPrior({"a": (0.0, 1.0)})

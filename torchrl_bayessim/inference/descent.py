@@ -30,7 +30,7 @@ from .weights import weights_of
 
 _FREE = 0.6  # share of the epochs that do without the box
 _PATIENCE = 25  # epochs without improvement
-_IN_VAIN = 0.12  # at most, as a share of the epochs, once the box is in
+_IN_VAIN = 0.12  # at most, as a share of the epochs, in the last part
 _GATHERED = 64  # minibatches of which the pairs are gathered at once
 
 
@@ -67,8 +67,9 @@ def descend(
         lr: Highest learning rate.
         weight_decay: Of AdamW.
         patience: Epochs that do not improve the mean loss of all posteriors, after which the box
-            comes in, and then the end. None for 25, but with the box, where the learning rate is
-            low, for no more than 12 % of ``epochs``: what is overfitted by then only gets worse.
+            comes in, and then the end; counted anew where the last part begins. None for 25, but
+            in the last part, where the learning rate is low, for no more than 12 % of ``epochs``:
+            what is overfitted by then only gets worse.
         seeds: Of the minibatches, one for each posterior.
         progress: Whether to show a progress bar.
 
@@ -124,14 +125,15 @@ def _epochs(
     gathered = max(1, min(_GATHERED, PART // (size * length)))
     step = Steps(networks, epochs * math.ceil(count / length), lr=lr, weight_decay=weight_decay)
     best, least = torch.full((size,), math.inf), math.inf
-    truncated, stale = first.prior.box is None, 0
+    truncated, late, stale = first.prior.box is None, False, 0
     in_vain = patience or min(_PATIENCE, max(1, round(_IN_VAIN * epochs)))
     patience = patience or _PATIENCE
     trace: list[tuple[Tensor, Tensor]] = []
     bar = tqdm(range(epochs), desc="fit", disable=not progress, leave=False, unit="epoch")
     for epoch in bar:
-        if not truncated and (epoch >= min(_FREE * epochs, epochs - 1) or stale >= patience):
-            truncated, stale = True, 0
+        spent = not truncated and stale >= patience
+        if not late and (spent or epoch >= min(_FREE * epochs, epochs - 1)):
+            truncated, late, stale = True, True, 0
         order = torch.stack([torch.randperm(count, generator=g) for g in shuffles])
         parts = [
             _learn(first, networks, pairs(rows), step, length=length, truncated=truncated)
@@ -147,7 +149,7 @@ def _epochs(
             networks.keep(better)
         mean = held_out.mean().item()
         least, stale = (mean, 0) if mean < least - 1e-4 else (least, stale + 1)
-        if truncated and stale >= in_vain:
+        if truncated and stale >= (in_vain if late else patience):
             break
     return trace
 
