@@ -181,9 +181,9 @@ def as_preset(task: GoalTask, preset: str, *, rounds: int = 1) -> GoalTask:
         got = f"{preset} on {task.simulator_name}"
         hint = "fast, which on this task has the large networks"
         raise ValueError(message("a preset that changes something", got, hint=hint))
-    return {"fast": lambda: task, "wide": lambda: wide(task), "paper": lambda: paper(task, rounds)}[
-        preset
-    ]()
+    if preset == "paper":
+        return paper(task, rounds)
+    return wide(task) if preset == "wide" else task
 
 
 def wide(task: GoalTask) -> GoalTask:

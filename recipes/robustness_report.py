@@ -44,11 +44,11 @@ def curves(runs: list[dict[str, Any]], robot: dict[str, float]) -> list[dict[str
 
 def _with_robot(run: dict[str, Any], name: str, truth: float) -> tuple[list[float], list[float]]:
     """Return grid and scores along one parameter, with what the policy scores at the robot."""
-    points = dict(zip(run["grids"][name]["grid"], run["grids"][name]["score"], strict=True))
-    near = [value for value in points if math.isclose(value, truth, rel_tol=1e-5)]
-    points = {value: score for value, score in points.items() if value not in near}
-    points[truth] = run["at_real"]  # of more episodes than a point of the grid
-    return [list(column) for column in zip(*sorted(points.items()), strict=True)]  # pyright: ignore
+    points = zip(run["grids"][name]["grid"], run["grids"][name]["score"], strict=True)
+    others = [point for point in points if not math.isclose(point[0], truth, rel_tol=1e-5)]
+    # of more episodes than a point of the grid
+    every = sorted([*others, (truth, run["at_real"])])
+    return [value for value, _ in every], [score for _, score in every]
 
 
 def compared(runs: list[dict[str, Any]], where: str) -> dict[str, Any]:

@@ -125,18 +125,18 @@ def _epochs(
     gathered = max(1, min(_GATHERED, PART // (size * length)))
     step = Steps(networks, epochs * math.ceil(count / length), lr=lr, weight_decay=weight_decay)
     best, least = torch.full((size,), math.inf), math.inf
-    truncated, late, stale = first.prior.box is None, False, 0
+    boxed, late, stale = first.prior.box is not None, False, 0
     in_vain = patience or min(_PATIENCE, max(1, round(_IN_VAIN * epochs)))
     patience = patience or _PATIENCE
     trace: list[tuple[Tensor, Tensor]] = []
     bar = tqdm(range(epochs), desc="fit", disable=not progress, leave=False, unit="epoch")
     for epoch in bar:
-        spent = not truncated and stale >= patience
+        spent = boxed and stale >= patience
         if not late and (spent or epoch >= min(_FREE * epochs, epochs - 1)):
-            truncated, late, stale = True, True, 0
+            late, stale = True, 0
         order = torch.stack([torch.randperm(count, generator=g) for g in shuffles])
         parts = [
-            _learn(first, networks, pairs(rows), step, length=length, truncated=truncated)
+            _learn(first, networks, pairs(rows), step, length=length, truncated=late)
             for rows in order.split(gathered * length, 1)
         ]
         total, weight = torch.stack(parts).sum(0)
@@ -149,7 +149,7 @@ def _epochs(
             networks.keep(better)
         mean = held_out.mean().item()
         least, stale = (mean, 0) if mean < least - 1e-4 else (least, stale + 1)
-        if truncated and stale >= (in_vain if late else patience):
+        if (late or not boxed) and stale >= (in_vain if late else patience):
             break
     return trace
 

@@ -223,9 +223,10 @@ def _check(
     check_number("validation_fraction", options["validation_fraction"], above=0.0, below=1.0)
     check_number("lr", options["lr"], above=0.0)
     check_number("weight_decay", options["weight_decay"], least=0.0)
-    for name in ("epochs", "batch_size", "patience"):
-        if name != "patience" or options[name] is not None:
-            check_count(name, options[name])
+    for name in ("epochs", "batch_size"):
+        check_count(name, options[name])
+    if options["patience"] is not None:
+        check_count("patience", options["patience"])
 
 
 def _defaults() -> dict[str, Any]:
