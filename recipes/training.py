@@ -86,10 +86,11 @@ def train(
         progress: Whether to show one.
 
     Raises:
-        ValueError: The checkpoint is damaged, or of another training: of another key, or of a
-            learner with other settings or networks.
+        ValueError: The checkpoint is damaged, or of another training: of another key, of a plan
+            that trains otherwise, or of a learner with other settings or networks.
     """
-    made_by = {"settings": dict(getattr(learner, "settings", {})), "key": list(key)}
+    settings = dict(getattr(learner, "settings", {}))
+    made_by = {"settings": settings, "plan": _course(plan), "key": list(key)}
     state: dict[str, Any] = {"batch": 0, "curve": [], "best": {}, "best_score": -float("inf")}
     if plan.file is not None and plan.file.exists():
         state = checkpoint.load(plan.file)
@@ -116,15 +117,23 @@ def train(
     return Trained(state["curve"], state["best"] or _weights(learner))
 
 
+def _course(plan: Plan) -> dict[str, Any]:
+    """Return what of a plan changes the training; without a decay more batches only go on."""
+    course = {"horizon": plan.horizon, "keep_every": plan.keep_every, "decays": plan.decays}
+    return course | ({"batches": plan.batches} if plan.decays else {})
+
+
 def _check_made_by(made_by: dict[str, Any], state: dict[str, Any], file: Path) -> None:
     """Refuse the checkpoint of another training; older ones, which do not say, are let pass."""
-    key, settings = made_by["key"], made_by["settings"]
+    key = made_by["key"]
     if state.get("key", key) != key:
         raise ValueError(_another(f"key={tuple(key)}", tuple(state["key"]), file))
-    found = state.get("settings", settings)
-    for name in settings | found:
-        if settings.get(name) != found.get(name):
-            raise ValueError(_another(f"{name}={settings.get(name)!r}", found.get(name), file))
+    for part in ("settings", "plan"):
+        asked = made_by[part]
+        found = state.get(part, asked)
+        for name in asked | found:
+            if asked.get(name) != found.get(name):
+                raise ValueError(_another(f"{name}={asked.get(name)!r}", found.get(name), file))
 
 
 def _another(expected: str, got: object, file: Path) -> str:

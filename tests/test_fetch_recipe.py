@@ -192,12 +192,12 @@ def test_a_checkpoint_of_another_training_is_refused(recipes, tmp_path):
 
     task, file = FETCH["fetch_reach"], tmp_path / "kept.pt"
 
-    def trained(key=(0,), **options):
+    def trained(key=(0,), plan=None, **options):
         randomizer = DomainRandomizer(task.prior)
         env = task.make(2, seed=0, randomizer=randomizer)
         small = {"hidden": (16,), "batch_size": 32, "updates_per_frame": 0.02, **options}
         learner = task.learner(env, seed=0, **small)
-        plan = Plan(1, task.horizon, file=file)
+        plan = Plan(**{"batches": 1, "horizon": task.horizon, "file": file} | (plan or {}))
         return train(learner, env, randomizer, plan, key=key, progress=False).curve
 
     curve = trained()
@@ -205,12 +205,15 @@ def test_a_checkpoint_of_another_training_is_refused(recipes, tmp_path):
     for options, match in (
         ({"gamma": 0.9}, r"kept\.pt made with gamma=0\.9, got 0\.98\. Try: the settings"),
         ({"hidden": (8,)}, r"kept\.pt made with hidden=\[8\], got \[16\]"),
+        ({"plan": {"batches": 2}}, r"kept\.pt made with batches=2, got 1"),
+        ({"plan": {"horizon": 100}}, r"kept\.pt made with horizon=100, got 50"),
+        ({"plan": {"decays": False}}, r"kept\.pt made with decays=False, got True"),
         ({"key": (1,)}, r"kept\.pt made with key=\(1,\), got \(0,\)"),
     ):
         with pytest.raises(ValueError, match=match):
             trained(**options)
     older = checkpoint.load(file)
-    del older["settings"], older["key"]
+    del older["settings"], older["plan"], older["key"]
     checkpoint.save(file, older)
     assert trained(gamma=0.9) == curve
     with pytest.raises(ValueError, match=r"kept\.pt made with this learner's networks, got.*size"):
