@@ -186,6 +186,20 @@ def as_preset(task: GoalTask, preset: str, *, rounds: int = 1) -> GoalTask:
     return wide(task) if preset == "wide" else task
 
 
+def with_learner(
+    task: GoalTask, *, algorithm: str = "", critic_sees_physics: bool = False, short: bool = False
+) -> GoalTask:
+    """Return the task with another algorithm, another critic, or a learner that learns little."""
+    ddpg = dict(task.ddpg)
+    if algorithm:
+        ddpg["algorithm"] = algorithm
+    if critic_sees_physics:
+        ddpg["critic_keys"] = ("theta",)
+    if short:
+        ddpg |= {"hidden": (32, 32), "batch_size": 64, "updates_per_frame": 0.02}
+    return replace(task, ddpg=ddpg)
+
+
 def wide(task: GoalTask) -> GoalTask:
     """Return Push with DDPG's own settings, in 16 environments."""
     return replace(

@@ -25,7 +25,7 @@ from typing import Any
 
 import recipe
 import torch
-from fetch_tasks import FETCH, PRESETS, GoalTask, as_preset
+from fetch_tasks import FETCH, PRESETS, GoalTask, as_preset, with_learner
 from robustness_report import compared, curves, draw_pictures, table
 from robustness_study import Study, nominal
 from tasks import TASKS, Task
@@ -75,6 +75,7 @@ class Robustness(recipe.Settings):
     batches: int = 0  # of training per policy; 0 for the task's own number
     setting: str = ""  # paper or strong (CartPole), fast, wide or paper (Fetch); or the first
     algorithm: str = ""  # ddpg or td3; empty for the task's own
+    critic_sees_physics: bool = False  # of Fetch; the actor never does
     episodes: int = 8  # real episodes that the posterior is inferred from
     simulations: int = 512
     points: int = 10  # of the grid of each parameter, to which the robot is added
@@ -141,13 +142,17 @@ def chosen(settings: Robustness) -> Task:
         raise ValueError(message("a setting", settings.setting, available=available))
     if isinstance(task, GoalTask):
         task = as_preset(task, settings.setting)
-        ddpg = dict(task.ddpg) | ({"algorithm": settings.algorithm} if settings.algorithm else {})
         if settings.short:
-            ddpg |= {"hidden": (32, 32), "batch_size": 64, "updates_per_frame": 0.02}
             task = replace(task, environments=4)
-        return replace(task, ddpg=ddpg)
-    if settings.algorithm:
-        raise ValueError(message("an algorithm for Fetch tasks only", settings.algorithm))
+        return with_learner(
+            task,
+            algorithm=settings.algorithm,
+            critic_sees_physics=settings.critic_sees_physics,
+            short=settings.short,
+        )
+    if settings.algorithm or settings.critic_sees_physics:
+        got = settings.algorithm or "critic_sees_physics=true"
+        raise ValueError(message("an algorithm or a critic's view for Fetch tasks only", got))
     given = PPO_SETTINGS[settings.setting]
     settings.batches = settings.batches or given["budget"]
     ppo = {**given["ppo"], "final_learning_rate": 0.0} | ({"epochs": 2} if settings.short else {})

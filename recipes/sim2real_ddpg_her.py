@@ -22,7 +22,7 @@ from typing import Any
 
 import recipe
 from collectors import collectors
-from fetch_tasks import FETCH, MEASURED, GoalTask, as_preset
+from fetch_tasks import FETCH, MEASURED, GoalTask, as_preset, with_learner
 from rounds import Journal, compare, describe, draw_pictures, sentence, shown
 from scipy.stats import binomtest
 from tasks import true_parameters
@@ -121,18 +121,18 @@ def chosen(settings: Sim2RealFetch) -> GoalTask:
     for name in ("rounds", "episodes", "simulations"):
         check_count(f"{name}=", getattr(settings, name))
     task = as_preset(FETCH[settings.task], settings.preset, rounds=settings.rounds)
-    ddpg = dict(task.ddpg)
-    if settings.algorithm:
-        ddpg["algorithm"] = settings.algorithm
-    if settings.critic_sees_physics:
-        ddpg["critic_keys"] = ("theta",)
     warmup, updates = settings.warmup or task.warmup, settings.updates or task.updates
     if settings.short:
         settings.simulations, settings.episodes = min(settings.simulations, 48), 2
         warmup, updates = settings.warmup or 2, settings.updates or 2
-        ddpg |= {"hidden": (32, 32), "batch_size": 64, "updates_per_frame": 0.02}
         task = replace(task, environments=8, shared_batches=1)
-    return replace(task, warmup=warmup, updates=updates, ddpg=ddpg)
+    task = with_learner(
+        task,
+        algorithm=settings.algorithm,
+        critic_sees_physics=settings.critic_sees_physics,
+        short=settings.short,
+    )
+    return replace(task, warmup=warmup, updates=updates)
 
 
 class GoalScore:

@@ -77,7 +77,8 @@ def test_finished_policies_are_not_trained_again(finished, run, capsys):
         (["task=cartpol"], "got 'cartpol'. Available: cartpole (did you mean this?)"),
         (["sources=prior,posteriori"], "got 'posteriori'. Available: posterior (did you mean"),
         (["sources=posterior"], "expected the prior among the sources"),
-        (["algorithm=td3"], "expected an algorithm for Fetch tasks only, got 'td3'"),
+        (["algorithm=td3"], "algorithm or a critic's view for Fetch tasks only, got 'td3'"),
+        (["critic_sees_physics=true"], "for Fetch tasks only, got 'critic_sees_physics=true'"),
         (["setting=weak"], "expected a setting, got 'weak'. Available: paper, strong"),
         (["task=fetch_push", "setting=strong"], "got 'strong'. Available: fast, wide, paper"),
         (
@@ -97,6 +98,12 @@ def test_bad_settings_are_explained(arguments, said, run, tmp_path, capsys):  # 
         run("short=true", *arguments, f"out={tmp_path}")
     (line,) = [x for x in capsys.readouterr().err.splitlines() if x.startswith("robustness")]
     assert said in line
+
+
+def test_the_table_says_what_the_critic_sees(run, tmp_path):
+    asked = ["task=fetch_reach", "sources=oracle", "critic_sees_physics=true"]
+    run(*TINY, *asked, f"out={tmp_path}")
+    assert "DDPG+HER, critic sees theta" in (tmp_path / "table.md").read_text()
 
 
 def test_the_robot_replaces_a_point_of_the_grid_that_is_its_own(run):

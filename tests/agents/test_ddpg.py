@@ -103,6 +103,7 @@ def test_a_delayed_actor_of_ddpg_learns_as_often_as_is_said_and_in_tables_too(ep
 
 def test_the_critic_sees_the_physics_and_the_actor_never(episodes):
     learner = DDPG(push(), goal_reward, critic_keys=["theta"], **SMALL)
+    assert learner.name == "DDPG+HER, critic sees theta"
     learner.update(episodes, key=(0,))
     assert "theta" not in learner.policy.in_keys
     steps = episodes.reshape(-1)[:10]

@@ -70,7 +70,8 @@ class DDPG:
     Attributes:
         policy: Reads observation and desired goal, writes ``action``; hand it to a collector. It
             explores unless `set_exploration_type` says otherwise.
-        name: ``DDPG+HER`` or ``TD3+HER``, for tables, and what is unusual about its actor.
+        name: ``DDPG+HER`` or ``TD3+HER``, for tables, and what is unusual about its actor
+            or critic.
         buffer: The replay buffer.
         settings: What updates depend on; a loop refuses the checkpoint of other ones.
 
@@ -145,9 +146,7 @@ class DDPG:
             raise ValueError(
                 message(f"a replay buffer of at least one batch of {batch_size}", capacity)
             )
-        self.name = f"{algorithm.upper()}+HER"
-        if every != usual:
-            self.name += f", actor {f'once in {every} updates' if every > 1 else 'at every update'}"
+        self.name = _name(algorithm, None if every == usual else every, critic_keys)
         self.batch_size = batch_size
         self.updates_per_frame, self._actor_every = updates_per_frame, every
         self._rates = learning_rate, final_learning_rate, decay_from
@@ -364,6 +363,17 @@ class DDPG:
         """Return the parameters of networks and target networks, in place."""
         sources = dict(self._loss.named_parameters()) | dict(self._loss.named_buffers())
         return {name: value.data for name, value in sources.items() if "network_params" in name}
+
+
+def _name(algorithm: str, actor_every: int | None, critic_keys: Sequence[str]) -> str:
+    """Return what tables call it, with an actor's delay that is not the algorithm's own."""
+    parts = [f"{algorithm.upper()}+HER"]
+    if actor_every is not None:
+        often = f"once in {actor_every} updates" if actor_every > 1 else "at every update"
+        parts.append(f"actor {often}")
+    if critic_keys:
+        parts.append(f"critic sees {' and '.join(map(str, critic_keys))}")
+    return ", ".join(parts)
 
 
 def _check_rewards(rewards: Any) -> None:
