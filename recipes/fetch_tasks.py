@@ -108,13 +108,15 @@ def pushes(state: Tensor, action: Tensor, next_state: Tensor, mask: Tensor) -> T
 
 
 # With DDPG's own settings the updates of a frame take three times as long as its simulation. These
-# have a fifth of the multiplications; 0.95 is the discount of rl-zoo's agents for Fetch.
+# have a fifth of the multiplications; 0.95 is the discount of rl-zoo's agents for Fetch. The critic
+# sees friction: on seed 7 the policy passed 0.95 after 414,000 frames so, 532,000 otherwise.
 PUSH: dict[str, Any] = {
     "hidden": (256, 256),
     "actor_every": 2,
     "updates_per_frame": 0.1,
     "gamma": 0.95,
     "tau": 0.01,
+    "critic_keys": ("theta",),
 }
 
 FETCH: dict[str, GoalTask] = {
@@ -128,7 +130,7 @@ FETCH: dict[str, GoalTask] = {
         shared_batches=4,
         warmup=125,
         updates=62,
-        budget=300,
+        budget=375,
         ddpg=PUSH,
     ),
     "fetch_slide": goal_task(
@@ -208,7 +210,7 @@ def wide(task: GoalTask) -> GoalTask:
         shared_batches=8,
         warmup=250,
         updates=125,
-        budget=600,
+        budget=750,
         ddpg={},
     )
 
