@@ -147,7 +147,7 @@ def _nearer(
     mine = {kind(unit.effect) for unit in best.units if unit.name == name}
     starts = []
     for model in known:
-        added = [unit for unit in model.units if unit not in best.units]
+        added = model.beyond(best)
         other = {unit.effect.group for unit in added} != groups
         if other and {kind(unit.effect) for unit in added} == mine:
             strengths = model.fit.point.strengths

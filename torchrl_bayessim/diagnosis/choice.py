@@ -107,12 +107,12 @@ def _in_other_forms(
     train = sets[0]
     kinds: dict[str, Model] = {}
     for model in sorted(singles, key=lambda m: criterion(m, 1.0)):
-        kinds.setdefault(_beyond(base, model)[0].name, model)
+        kinds.setdefault(model.beyond(base)[0].name, model)
     laws = [u for u in offered if u.name in kinds and bendable(train, [u])]
     bends = set(kinds) if bendable(train, base.units) else {unit.name for unit in laws}
     plain = [m for name, m in kinds.items() if name in bends]
     plain = plain[:_FORMS]
-    softer = [point for m in plain for point in _as_offered(train, m, _beyond(base, m), laws)]
+    softer = [point for m in plain for point in _as_offered(train, m, m.beyond(base), laws)]
     plain += judged(*sets, refit(train, softer, iterations=4)) if softer else []
     tried = {m: with_fitted_forms(*sets, m, offered) for m in plain}
     fitted = [bent for plain, bent in tried.items() if bent is not plain]
@@ -135,9 +135,4 @@ def _as_offered(
 
 def _new_names(base: Model, model: Model) -> set[str]:
     """Return the effects that a model has beside those of its base."""
-    return {unit.name for unit in _beyond(base, model)}
-
-
-def _beyond(base: Model, model: Model) -> list[Unit]:
-    """Return the units that a model has and its base has not."""
-    return [unit for unit in model.units if unit not in base.units]
+    return {unit.name for unit in model.beyond(base)}

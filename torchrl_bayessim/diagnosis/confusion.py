@@ -71,7 +71,7 @@ def _alike_beside(selection: Selection, name: str) -> list[str]:
     groups = {kind(unit.effect) for unit in best.units if unit.name == name}
     found = []
     for model in selection.tried:
-        added = [unit for unit in model.units if unit not in best.units]
+        added = model.beyond(best)
         beside = len(model.units) == len(best.units) + len(added)
         if beside and {kind(unit.effect) for unit in added} == groups:
             less = float((best.deviances() - model.deviances()).sum())
@@ -123,7 +123,7 @@ def _another_form(selection: Selection, rival: Model, name: str, *, form: float)
     """Return whether a rival of the same group explains nearly all of the same."""
     best = selection.best
     mine = {kind(u.effect) for u in best.units if u.name == name}
-    others = {kind(u.effect) for u in rival.units if u not in best.units}
+    others = {kind(u.effect) for u in rival.beyond(best)}
     groups = {u.effect.group for u in (*best.units, *rival.units) if kind(u.effect) in mine}
     least = form if len(groups) == 1 else max(form, _ELSEWHERE)
     return mine == others and _short(selection, rival) < least
@@ -137,7 +137,7 @@ def _short(selection: Selection, rival: Model) -> float:
 
 def stand_in(selection: Selection, rival: Model) -> str:
     """Return the effect that a rival has in the place of one of the best model's."""
-    return next(unit.name for unit in rival.units if unit not in selection.best.units)
+    return rival.beyond(selection.best)[0].name
 
 
 def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> Selection:

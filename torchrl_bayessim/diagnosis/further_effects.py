@@ -102,7 +102,7 @@ def _elsewhere(base: Model, better: Model, seen: Screen, robot: Robot) -> bool:
     sensor. What those together cannot explain, and one effect elsewhere does far better than any of
     another kind, is that effect, however little of the gap it is.
     """
-    added = [unit for unit in better.units if unit not in base.units]
+    added = better.beyond(base)
     if len({unit.name for unit in added}) != 1 or gain(base, better) < _SURELY:
         return False
     places = {place for unit in base.units for place in _places(unit, robot)}
@@ -156,7 +156,7 @@ def _same(base: Model, better: Model, other: Model) -> bool:
 
 def _added(base: Model, model: Model) -> set[str]:
     """Return the kinds of what a model has beside those of its base."""
-    return {unit.effect.group for unit in model.units if unit not in base.units}
+    return {unit.effect.group for unit in model.beyond(base)}
 
 
 def nothing_left(start: Model, best: Model) -> bool:

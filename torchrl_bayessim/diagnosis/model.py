@@ -51,6 +51,10 @@ class Model:
         """The effects in it."""
         return self.fit.units
 
+    def beyond(self, base: Model) -> list[Unit]:
+        """Return the effects that it has and ``base`` has not."""
+        return [unit for unit in self.units if unit not in base.units]
+
     def deviances(self) -> Array:
         """Return misfits of all segments, training then validation."""
         return np.concatenate([(self.fit.innovations**2).sum(-1), (self.validation**2).sum(-1)])
