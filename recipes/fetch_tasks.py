@@ -157,8 +157,9 @@ FETCH: dict[str, GoalTask] = {
     ),
 }
 
-# Plappert et al. (2018), one worker: 200 epochs of 100 episodes, 400,000 updates. Target networks
-# there keep 0.95 once in 40 updates, here as much at every one.
+# Plappert et al. (2018), one worker: 200 epochs of 100 episodes, 400,000 updates. There 40 follow
+# two episodes, here 160 eight, since the first have to fill a batch. Target networks there keep
+# 0.95 once in 40 updates, here as much at every one.
 PAPER = {
     "algorithm": "ddpg",
     "updates_per_frame": 0.4,
@@ -189,14 +190,25 @@ def as_preset(task: GoalTask, preset: str, *, rounds: int = 1) -> GoalTask:
 
 
 def with_learner(
-    task: GoalTask, *, algorithm: str = "", critic_sees_physics: bool = False, short: bool = False
+    task: GoalTask,
+    *,
+    algorithm: str = "",
+    critic_sees_physics: bool | None = None,
+    short: bool = False,
 ) -> GoalTask:
-    """Return the task with another algorithm, another critic, or a learner that learns little."""
+    """Return the task with another algorithm, another critic, or a learner that learns little.
+
+    Args:
+        task: Whose own settings hold where nothing is said.
+        algorithm: Of `DDPG`, or empty.
+        critic_sees_physics: Whether ``theta`` is shown to the critic, or None.
+        short: Whether to learn little.
+    """
     ddpg = dict(task.ddpg)
     if algorithm:
         ddpg["algorithm"] = algorithm
-    if critic_sees_physics:
-        ddpg["critic_keys"] = ("theta",)
+    if critic_sees_physics is not None:
+        ddpg["critic_keys"] = ("theta",) if critic_sees_physics else ()
     if short:
         ddpg |= {"hidden": (32, 32), "batch_size": 64, "updates_per_frame": 0.02}
     return replace(task, ddpg=ddpg)
@@ -217,11 +229,11 @@ def wide(task: GoalTask) -> GoalTask:
 
 def paper(task: GoalTask, rounds: int) -> GoalTask:
     """Return the task with the original settings and 1,000,000 frames in ``rounds`` rounds."""
-    batches = 10_000  # of two episodes
+    batches = 2_500  # of eight episodes
     warmup = batches // 2
     return replace(
         task,
-        environments=2,
+        environments=8,
         warmup=warmup,
         updates=(batches - warmup) // rounds,
         budget=batches,

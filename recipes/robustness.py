@@ -75,7 +75,7 @@ class Robustness(recipe.Settings):
     batches: int = 0  # of training per policy; 0 for the task's own number
     setting: str = ""  # paper or strong (CartPole), fast, wide or paper (Fetch); or the first
     algorithm: str = ""  # ddpg or td3; empty for the task's own
-    critic_sees_physics: bool = False  # of Fetch; the actor never does
+    critic_sees_physics: bool | None = None  # of Fetch; None for the task's own
     episodes: int = 8  # real episodes that the posterior is inferred from
     simulations: int = 512
     points: int = 10  # of the grid of each parameter, to which the robot is added
@@ -150,8 +150,8 @@ def chosen(settings: Robustness) -> Task:
             critic_sees_physics=settings.critic_sees_physics,
             short=settings.short,
         )
-    if settings.algorithm or settings.critic_sees_physics:
-        got = settings.algorithm or "critic_sees_physics=true"
+    if settings.algorithm or settings.critic_sees_physics is not None:
+        got = settings.algorithm or f"critic_sees_physics={settings.critic_sees_physics}"
         raise ValueError(message("an algorithm or a critic's view for Fetch tasks only", got))
     given = PPO_SETTINGS[settings.setting]
     settings.batches = settings.batches or given["budget"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,7 @@ class Study:
         self.task, self.truth, self.settings, self.seed = task, truth, settings, seed
         self.out = out
         self.randomizer = DomainRandomizer(task.prior, seed=seed)
+        self._begun = self.randomizer.get_extra_state()
         self.env = task.make(task.environments, seed=seed, randomizer=self.randomizer)
         check_influence(self.env, self.randomizer, task.prior, steps=task.horizon)
         self.algorithm = getattr(self._learner(), "name", "PPO")
@@ -83,6 +85,7 @@ class Study:
 
     def _trained(self, source: str, learner: Any) -> Any:
         self.randomizer.source = self._source(source)
+        self.randomizer.set_extra_state(self._begun)  # the same first episode for all sources
         goals = isinstance(self.task, GoalTask)
         batches = self.settings.batches or getattr(self.task, "budget", 0)
         plan = Plan(
@@ -90,7 +93,7 @@ class Study:
             self.task.horizon,
             file=self.out / f"{source}.pt",
             keep_every=50 if goals else 200,
-            score_every=max(1, batches // SCORED),
+            score_every=math.ceil(batches / SCORED) or 1,
         )
         return train(
             learner,

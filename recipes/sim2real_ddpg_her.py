@@ -57,7 +57,7 @@ class Sim2RealFetch(recipe.Settings):
     warmup: int = 0  # batches for the data-collecting policy; 0 for the task's own number
     updates: int = 0  # batches per round under the posterior; 0 for the task's own number
     algorithm: str = ""  # ddpg or td3; empty for the task's own
-    critic_sees_physics: bool = False
+    critic_sees_physics: bool | None = None  # None for the task's own
     preset: str = "fast"  # or "wide", or "paper"
     baseline: bool = True  # also go on under the prior, with as many frames
     collector: str = "direct"  # or "ray": the loop simulates in Ray's workers
@@ -245,7 +245,12 @@ class Run:
     def _train(self, name: str, batches: int, *, decays: bool) -> Trained:
         self.randomizer.source = self.task.prior
         plan = Plan(
-            batches, self.task.horizon, decays=decays, file=self.out / f"{name}.pt", keep_every=50
+            batches,
+            self.task.horizon,
+            decays=decays,
+            file=self.out / f"{name}.pt",
+            keep_every=50,
+            score_every=max(20, batches // 25),  # for the picture only
         )
         select = GoalScore(self.task, self.task.prior, episodes=64, seed=seed_from(name) % 2**31)
         return train(

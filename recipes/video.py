@@ -56,20 +56,28 @@ def record(
     os.environ.setdefault("MUJOCO_GL", "egl")
     gymnasium.register_envs(gymnasium_robotics)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            name, shape = task.simulator_name, {"width": size, "height": size}
-            filmed = GymEnv(name, from_pixels=True, pixels_only=False, **shape)
-    except Exception as error:
+        _film(task, policy, theta, path, episodes=episodes, size=size)
+    except Exception as error:  # a driver's, at any step of it; the job goes on without
         print(f"no video: {type(error).__name__}: {error}")
         return None
+    return str(path)
+
+
+def _film(
+    task: GoalTask, policy: Any, theta: Tensor, path: Path, *, episodes: int, size: int
+) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        name, shape = task.simulator_name, {"width": size, "height": size}
+        filmed = GymEnv(name, from_pixels=True, pixels_only=False, **shape)
     recorder = VideoRecorder(GifLogger(path), tag=path.stem, skip=1)
     physics = ApplyPhysics(task.physics()), DomainRandomizer(Grid(theta[None]))
     env = TransformedEnv(filmed, Compose(*physics, DoubleToFloat(), recorder))
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        env.set_seed(0)
-        for _ in range(episodes):
-            env.rollout(task.max_steps, policy)
-    recorder.dump()
-    env.close()
-    return str(path)
+    try:
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            env.set_seed(0)
+            for _ in range(episodes):
+                env.rollout(task.max_steps, policy)
+        recorder.dump()
+    finally:
+        env.close()

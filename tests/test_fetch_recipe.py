@@ -49,7 +49,7 @@ def test_the_same_seed_gives_the_same_numbers(finished, run, same_numbers, tmp_p
 def test_the_result_has_what_others_read(finished):
     result = json.loads((finished / "result.json").read_text())
     assert {"task", "parameters", "true", "rounds", "baseline", "checkpoint"} <= result.keys()
-    assert result["algorithm"] == "TD3+HER"
+    assert result["algorithm"] == "TD3+HER, critic sees theta"
     assert result["parameters"] == ["damping"]
     (entry,) = result["rounds"]
     assert entry.keys() == {
@@ -141,6 +141,25 @@ def test_the_paper_preset_has_the_original_budget(recipes):
     assert batches * task.environments == 200 * 100
     assert batches * task.environments * task.horizon * task.ddpg["updates_per_frame"] == 400_000
     assert (1 - task.ddpg["tau"]) ** 40 == pytest.approx(0.95)
+
+
+def test_the_paper_preset_trains_from_its_first_batch_on(recipes):
+    from fetch_tasks import FETCH, as_preset
+
+    task = as_preset(FETCH["fetch_reach"], "paper")
+    env = task.make(task.environments, seed=0, randomizer=None)
+    learner = task.learner(env)
+    with torch.no_grad():
+        report = learner.update(env.rollout(task.horizon, learner.policy), key=(0,))
+    assert report["updates"] == 160
+
+
+def test_whether_the_critic_sees_the_physics_can_be_said_for_every_task(recipes):
+    from fetch_tasks import FETCH, with_learner
+
+    for task in FETCH.values():
+        assert with_learner(task, critic_sees_physics=True).ddpg["critic_keys"] == ("theta",)
+        assert with_learner(task, critic_sees_physics=False).ddpg["critic_keys"] == ()
 
 
 def test_training_goes_on_from_its_checkpoint_to_the_same_numbers(recipes, tmp_path):

@@ -1,6 +1,7 @@
 """The figure of robustness as users make it, in its shortest setting."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -71,6 +72,14 @@ def test_finished_policies_are_not_trained_again(finished, run, capsys):
     assert after["runs"] == before["runs"]
 
 
+def test_a_policy_trained_after_a_break_is_the_same(finished, run, same_numbers, tmp_path):
+    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
+    for path in tmp_path.glob("seed*/posterior*"):
+        path.unlink()
+    run(f"resume={tmp_path}", "progress=false")
+    same_numbers(tmp_path, finished)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -78,7 +87,7 @@ def test_finished_policies_are_not_trained_again(finished, run, capsys):
         (["sources=prior,posteriori"], "got 'posteriori'. Available: posterior (did you mean"),
         (["sources=posterior"], "expected the prior among the sources"),
         (["algorithm=td3"], "algorithm or a critic's view for Fetch tasks only, got 'td3'"),
-        (["critic_sees_physics=true"], "for Fetch tasks only, got 'critic_sees_physics=true'"),
+        (["critic_sees_physics=true"], "for Fetch tasks only, got 'critic_sees_physics=True'"),
         (["setting=weak"], "expected a setting, got 'weak'. Available: paper, strong"),
         (["task=fetch_push", "setting=strong"], "got 'strong'. Available: fast, wide, paper"),
         (

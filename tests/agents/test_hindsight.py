@@ -158,6 +158,10 @@ def far(achieved, desired):
         (lambda a, d: near(a, d) * torch.nan, "got 'nan; 10 of 10 differ'"),
         (lambda a, d: near(a, d).mean(), r"tensor of shape \(2, 5\), got \(\)"),
         (lambda a, d: a - d, r"a reward for each transition.*got \(2, 5, 2\)"),
+        (
+            lambda a, d: -torch.ones(a.shape[:-1]),  # which agrees until a goal is reached
+            "greater where the goal is reached, got '-1 there, -1 far from it'",
+        ),
         (lambda a, d: -1.0, "a reward for each transition.*got 'float'"),
     ],
 )
@@ -177,6 +181,13 @@ def test_a_reward_may_have_a_column_or_differ_where_a_goal_lies_at_the_threshold
     episodes["next", "reward"][2, 0] = 0.0
     with pytest.raises(ValueError, match="own reward, 0 for a transition, got '-1; 21 of 200 dif"):
         buffer.extend(episodes)
+
+
+def test_a_reward_with_another_threshold_is_told_by_the_few_goals_that_are_reached():
+    episodes = tagged(0, lengths=(10,), rows=100)
+    episodes["next", "reward"][:6] = 0.0
+    with pytest.raises(ValueError, match="own reward, 0 for a transition, got '-1; 60 of 1000"):
+        HindsightReplayBuffer(near, capacity=1000).extend(episodes)
 
 
 @pytest.mark.parametrize(

@@ -213,6 +213,7 @@ class DDPG:
         kept = batch.select(*self.kept_keys).detach()  # actions may come with the policy's graph
         before = copy.deepcopy(self._learned())
         self.buffer.extend(kept)
+        self.state.observe(kept)
         if len(self.buffer) < self.batch_size:
             raise ValueError(
                 message(
@@ -221,7 +222,6 @@ class DDPG:
                     hint="more environments, or a smaller batch_size",
                 )
             )
-        self.state.observe(kept)
         updates = round(self.updates_per_frame * batch.numel())
         self._report = {"loss_actor": 0.0, "loss_critic": 0.0, "updates": float(updates)}
         self._report["learning_rate"] = self._set_learning_rate(progress)

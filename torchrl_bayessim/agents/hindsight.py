@@ -31,6 +31,8 @@ GoalReward = Callable[[Tensor, Tensor], Tensor]
 _FOLLOWING, _MOVES = "following", "moves"
 _ROUNDING = 0.01  # share of the greatest reward
 _OVER = 0.1  # share of the transitions that a sensor's noise or offset may carry over a threshold
+_RARE = 50  # transitions of other than the commonest reward, of which half have to agree
+_FAR = 1e3  # of any goal, in its unit
 
 
 class HindsightReplayBuffer(HERReplayBuffer):
@@ -103,8 +105,9 @@ class HindsightReplayBuffer(HERReplayBuffer):
 
         Raises:
             ValueError: A row ends within an episode, or holds more than fits. The function of the
-                reward gives another one than the environment in a tenth of the transitions, or
-                not one for each.
+                reward gives another one than the environment in a tenth of the transitions or in
+                half of those that are not rewarded like most, none for some, or no more for a goal
+                that is reached than for one far away.
         """
         done = episodes["next", "done"].reshape(episodes.batch_size)
         if episodes.ndim != 2 or not done[:, -1].all():
@@ -119,6 +122,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
         if done.numel() > self.capacity:
             raise ValueError(message(f"at most {self.capacity} transitions at once", done.numel()))
         _check_reward(self._reward, episodes)
+        _check_goals(self._reward, episodes["next", "achieved_goal"])
         end = _end_of_episode(done)
         time = torch.arange(done.shape[1])
         final = episodes["next", "achieved_goal"].gather(
@@ -202,9 +206,11 @@ def _check_reward(reward: GoalReward, episodes: TensorDictBase) -> None:
         got = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
         raise ValueError(message(f"a reward for each transition, a tensor of shape {shape}", got))
     own, found = own.reshape(-1).double(), found.reshape(-1).double()
-    near = torch.isclose(found, own, rtol=0.0, atol=_ROUNDING * own.abs().max().item() + 1e-6)
-    far = (~near).nonzero().flatten()
-    if len(far) > _OVER * len(own):
+    tolerance = _ROUNDING * own.abs().max().item() + 1e-6
+    usual = own.median()
+    rare = ((own - usual).abs() > tolerance) | ((found - usual).abs() > tolerance)
+    far = (~((own - found).abs() <= tolerance)).nonzero().flatten()  # not a number is far, too
+    if len(far) > _OVER * len(own) or (rare.sum() >= _RARE and len(far) > rare.sum() / 2):
         first = far[0]
         raise ValueError(
             message(
@@ -212,6 +218,25 @@ def _check_reward(reward: GoalReward, episodes: TensorDictBase) -> None:
                 f"{found[first]:g}; {len(far)} of {len(own)} differ",
                 hint="a reward(achieved_goal, desired_goal) with the environment's sign and "
                 "threshold, sparse where the environment's is sparse",
+            )
+        )
+
+
+def _check_goals(reward: GoalReward, achieved: Tensor) -> None:
+    """Refuse a reward that hindsight could not learn from: what was reached has to be worth more.
+
+    Before a goal is reached the environment's own rewards would not tell.
+    """
+    with torch.no_grad():
+        there, far = (
+            reward(achieved, goal).double().mean() for goal in (achieved, achieved + _FAR)
+        )
+    if not there > far:
+        raise ValueError(
+            message(
+                "a reward that is greater where the goal is reached",
+                f"{there:g} there, {far:g} far from it",
+                hint="a reward(achieved_goal, desired_goal) with the environment's threshold",
             )
         )
 
