@@ -1,4 +1,5 @@
 import io
+from functools import partial
 
 import gymnasium
 import pytest
@@ -416,9 +417,24 @@ def test_other_names_than_the_writer_are_an_error():
         with pytest.raises(PhysicsError, match="name the parameters alike, in the same order"):
             env.reset()
         env.close(raise_if_closed=False)
+    nested = SerialEnv(2, lambda: SerialEnv(2, physical))
+    env = TransformedEnv(nested, DomainRandomizer(Empirical([[1.0, 1.0]], names=swapped)))
+    with pytest.raises(PhysicsError, match="name the parameters alike, in the same order"):
+        env.reset()
     randomizer = DomainRandomizer(Uniform())
     with pytest.raises(ValueError, match="expected a source over"):
         randomizer.source = Empirical([[1.0, 1.0]], names=swapped)
+
+
+@pytest.mark.parametrize("batched", [SerialEnv, ParallelEnv])
+def test_batches_of_batches_are_randomized(batched):
+    env = batched(2, partial(SerialEnv, 3, physical))
+    env = TransformedEnv(env, DomainRandomizer(Uniform(), seed=0))
+    steps = env.rollout(3)
+    assert steps["theta"][..., 0, :].shape == (2, 3, 2)
+    assert len(steps["theta"][..., 0, :].flatten(0, 1).unique(dim=0)) == 6
+    assert_simulator_holds_theta(steps)
+    env.close()
 
 
 def test_bad_theta_is_refused():

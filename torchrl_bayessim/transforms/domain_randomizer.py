@@ -224,7 +224,7 @@ class DomainRandomizer(Transform):
         if self._checked or (isinstance(env, SerialEnv | ParallelEnv) and env.is_closed):
             return
         found = getattr(env, "physics_names", dict)()
-        for known in found if isinstance(found, list) else [found]:
+        for known in _each(found):
             if self.names is not None and known.get(self.key, self.names) != self.names:
                 raise PhysicsError(
                     message(
@@ -327,3 +327,12 @@ class DomainRandomizer(Transform):
 def randomizers(env: EnvBase | None) -> Iterator[DomainRandomizer]:
     """Yield the randomizers among the transforms of an environment, and of those that it wraps."""
     yield from transforms_of(env, DomainRandomizer)
+
+
+def _each(found: Any) -> Iterator[dict[Any, Any]]:
+    """Yield what each simulator answered; batches of batches answer in lists of lists."""
+    if not isinstance(found, list):
+        yield found
+        return
+    for one in found:
+        yield from _each(one)
