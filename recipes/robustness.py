@@ -3,9 +3,10 @@
     python recipes/robustness.py task=cartpole
     python recipes/robustness.py task=fetch_push out=recipes/results/robustness_fetch_push
 
-One policy per seed and source of physics, each with as many frames: the simulator's nominal
-physics, the prior, the posterior, and the robot's true physics (oracle). The posterior is inferred
-from a few episodes of the seed's own prior policy at the robot. All policies are then scored in
+One policy per seed and source of physics, each with as many frames of training: the simulator's
+nominal physics, the prior, the posterior, and the robot's true physics (oracle). The posterior is
+inferred from a few episodes of the seed's own prior policy at the robot; what is simulated for that
+comes on top, and is told. All policies are then scored in
 the same episodes: over a grid of each parameter with the others at the truth, at the robot, and
 under physics drawn from the prior. Posterior and prior are compared in pairs: one difference per
 seed, with its Student interval. Episodes by which a checkpoint is chosen are others.
@@ -113,6 +114,7 @@ def job(settings: Robustness, out: Path) -> dict[str, Any]:
         "score": "success" if isinstance(task, GoalTask) else "return",
         "seeds": len(seeds),
         "frames": int(runs[0]["curve"][-1]["frames"]),
+        "inference_frames": study.inference_frames if "posterior" in sources else 0,
         "real_episodes": runs[0]["real_episodes"],
         "curves": curves(runs, dict(zip(task.prior.names, truth.tolist(), strict=True))),
         "at_real": compared(runs, "at_real"),

@@ -82,8 +82,8 @@ def table(result: dict[str, Any]) -> str:
     seeds, score = result["seeds"], result["score"]
     lines = [
         f"{result['task']}, {result['algorithm']}, {seeds} seeds, {result['frames']:,} frames per "
-        f"policy, {score} in {result['real_episodes']} episodes at the robot "
-        f"({', '.join(f'{n} {v:.3g}' for n, v in _truth(result))})",
+        f"policy, {score} in the same {result['real_episodes']} episodes at the robot "
+        f"({', '.join(f'{n} {v:.3g}' for n, v in _truth(result))}){_besides(result)}",
         "",
         f"| trained under | {score} at the robot, mean and 95 % interval over seeds | spread (sd) "
         f"| each seed | {score} under the prior | its own physics first solved after (frames) |",
@@ -108,6 +108,12 @@ def table(result: dict[str, Any]) -> str:
         cell = ", ".join(f"{name} {mean:.3g} ± {sd:.2g}" for name, mean, sd in moments)
         lines.append(f"| {run['seed']} | {cell} | {run['posterior']['nats_over_prior']:+.1f} |")
     return "\n".join(lines) + "\n"
+
+
+def _besides(result: dict[str, Any]) -> str:
+    """Return what the posterior costs beside training."""
+    frames = result["inference_frames"]
+    return f"; the posterior took {frames:,} frames of simulation besides" if frames else ""
 
 
 def _with_interval(entry: dict[str, Any], *, share: bool) -> str:

@@ -46,11 +46,17 @@ class Study:
     def __init__(self, task: Task, truth: Tensor, settings: Any, out: Path, *, seed: int) -> None:
         self.task, self.truth, self.settings, self.seed = task, truth, settings, seed
         self.out = out
+        self.steps = min(128, task.max_steps)  # of a trajectory that inference sees
         self.randomizer = DomainRandomizer(task.prior, seed=seed)
         self._begun = self.randomizer.get_extra_state()
         self.env = task.make(task.environments, seed=seed, randomizer=self.randomizer)
         check_influence(self.env, self.randomizer, task.prior, steps=task.horizon)
         self.algorithm = getattr(self._learner(), "name", "PPO")
+
+    @property
+    def inference_frames(self) -> int:
+        """Frames that are simulated for the posterior, beside those of training."""
+        return self.settings.simulations * self.settings.episodes * self.steps
 
     def scored(self, source: str) -> dict[str, Any]:
         """Return the scores of the policy trained under ``source``, from its file if it has one."""
@@ -126,10 +132,9 @@ class Study:
         statistics = SummaryStatistics(*task.summaries)
         measured = MEASURED if isinstance(task, GoalTask) else ("observation",)
         env = task.make(settings.episodes, seed=self.seed, randomizer=None)
-        steps = min(128, task.max_steps)
-        robot = SurrogateRobot(env, self.truth, max_steps=steps, measured=measured)
+        robot = SurrogateRobot(env, self.truth, max_steps=self.steps, measured=measured)
         real = robot.rollouts(learner.policy, episodes=settings.episodes, key=(self.seed, "real"))
-        observed = statistics.together(comparable(real, horizon=steps))
+        observed = statistics.together(comparable(real, horizon=self.steps))
         randomizer = DomainRandomizer(task.prior, seed=self.seed)
         rows = min(64, settings.simulations * settings.episodes)
         pairs = simulate(
@@ -138,7 +143,7 @@ class Study:
             statistics,
             randomizer,
             pairs=settings.simulations,
-            max_steps=steps,
+            max_steps=self.steps,
             trajectories=settings.episodes,
             seed=self.seed,
             progress=settings.progress,

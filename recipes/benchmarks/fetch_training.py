@@ -2,14 +2,15 @@
 
 Both collect episodes with DDPG's exploring policy and TorchRL's collector, draw a new friction for
 each episode, fill the hindsight replay buffer, and make as many gradient updates per frame; one
-steps N environments natively, the other a ``SerialEnv`` of N gymnasium environments. They take
-turns, so ratios are within a run. While the native one steps in a thread of its own the learner
-makes its updates; Python simulators leave it no time. ``collect`` is the loop without its updates,
+steps N environments natively, the other a ``SerialEnv`` of N gymnasium environments or, with
+``processes=2``, a ``ParallelEnv`` of two halves. They take turns, so ratios are within a run. While
+the native one steps in a thread of its own the learner makes its updates; Python simulators leave
+it no time. ``collect`` is the loop without its updates,
 ``train`` the whole of it; environment frames per second. Learner and N are those of the recipes'
 task; ``preset=wide`` has larger networks and more updates, as in `fetch_tasks`::
 
     python recipes/benchmarks/fetch_training.py [task=fetch_push] [preset=wide] [runs=5]
-        [updates=0.2] [n=16] [matmul_precision=medium]
+        [updates=0.2] [n=16] [processes=2] [matmul_precision=medium]
 """
 
 from __future__ import annotations
@@ -26,7 +27,15 @@ import gymnasium
 import gymnasium_robotics
 import torch
 from measuring import compare, options, report
-from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymEnv, SerialEnv, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    DoubleToFloat,
+    EnvBase,
+    GymEnv,
+    ParallelEnv,
+    SerialEnv,
+    TransformedEnv,
+)
 
 from torchrl_bayessim import ApplyPhysics, DomainRandomizer, MujocoPhysics
 from torchrl_bayessim.agents.ddpg import DDPG
@@ -57,9 +66,10 @@ def one(simulator_name: str) -> EnvBase:
     return TransformedEnv(GymEnv(simulator_name), Compose(physics, DoubleToFloat()))
 
 
-def serial(task: GoalTask, n: int) -> EnvBase:
-    """Return n gymnasium-robotics environments in this process."""
-    env = SerialEnv(n, partial(one, task.simulator_name))
+def gym(task: GoalTask, n: int, processes: int) -> EnvBase:
+    """Return n gymnasium-robotics environments, in this process or in so many others."""
+    some = partial(SerialEnv, n // processes, partial(one, task.simulator_name))
+    env = some() if processes == 1 else ParallelEnv(processes, some)
     return TransformedEnv(env, DomainRandomizer(task.prior))
 
 
@@ -73,6 +83,7 @@ def loop(env: EnvBase, learner: DDPG, batches: int) -> Callable[[], int]:
         for index in range(batches):
             with isolated(index):
                 batch: Any = next_batch(collector, meanwhile=learning.meanwhile)
+            batch = batch.reshape(-1, STEPS)  # also of environments that stand in two rows
             if learner.updates_per_frame:
                 learning.update(batch, into={}, key=(index,))
             else:
@@ -87,7 +98,7 @@ def main(*arguments: str) -> None:
     names = {"task": "fetch_push", "preset": "fast", "matmul_precision": "medium", "updates": ""}
     rest = [a for a in arguments if a.partition("=")[0] not in names]
     given = {**names, **dict(a.split("=", 1) for a in arguments if a not in rest)}
-    counts = options(rest, optional=["n"], n=0, runs=5, threads=1, batches=1)
+    counts = options(rest, optional=["n"], n=0, runs=5, threads=1, batches=1, processes=1)
     for name, available in {
         "task": FETCH,
         "preset": PRESETS,
@@ -105,7 +116,8 @@ def main(*arguments: str) -> None:
     asked = {"updates_per_frame": float(given["updates"])} if given["updates"] else {}
     cases = {}
     for name, own in {"collect": {"updates_per_frame": 0.0}, "train": asked}.items():
-        for kind, make in {"": partial(batched, threads=threads), GYM: serial}.items():
+        gymnasiums = partial(gym, processes=counts["processes"])
+        for kind, make in {"": partial(batched, threads=threads), GYM: gymnasiums}.items():
             env = make(task, n)
             learner = task.learner(env, **own)
             cases[name + kind] = loop(env, learner, batches)
@@ -116,6 +128,7 @@ def main(*arguments: str) -> None:
         context = {"task": task.simulator_name, "n": n, "threads": threads, "seed": 0}
         context |= {"algorithm": learner.name, "updates": learner.updates_per_frame}
         context |= {"hidden": learner.settings["hidden"], "batches": batches}
+        context |= {"gym_processes": counts["processes"]}
         context |= {"preset": given["preset"], "matmul_precision": given["matmul_precision"]}
         report("fetch_training", name, values, against=against, **context)
 
