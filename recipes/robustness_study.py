@@ -10,16 +10,15 @@ from typing import Any
 import recipe
 import torch
 from fetch_tasks import MEASURED, GoalTask
+from scoring import Score
 from tasks import Task
 from torch import Tensor
 from training import Plan, first_solved, thinned, train
 
 from torchrl_bayessim import checkpoint
 from torchrl_bayessim.agents.ppo import PPO
-from torchrl_bayessim.evaluation import evaluate, successes
 from torchrl_bayessim.inference.refinement import PosteriorRefinement
 from torchrl_bayessim.influence import check_influence
-from torchrl_bayessim.randomness import isolated
 from torchrl_bayessim.real_trajectories import comparable
 from torchrl_bayessim.robots import SurrogateRobot
 from torchrl_bayessim.simulate import simulate
@@ -170,8 +169,8 @@ class Study:
 
     def _select(self, source: str) -> Any:
         """Return the score by which a checkpoint is chosen: other episodes, own physics."""
-        physics = self._source(source)
-        return lambda policy: self._score(policy, physics, count=CHOOSING, seed=7).mean().item()
+        score = Score(self.task, self._source(source), episodes=CHOOSING, seed=7)
+        return lambda policy: score(policy).mean().item()
 
     def _scores(self, policy: Any) -> dict[str, Any]:
         settings, truth = self.settings, self.truth
@@ -182,23 +181,16 @@ class Study:
             values = torch.linspace(low.item(), high.item(), settings.points)
             theta = truth.repeat(settings.points, 1)
             theta[:, column] = values
-            found = self._score(policy, Grid(theta), count=settings.points * episodes, seed=11)
+            score = Score(self.task, Grid(theta), episodes=settings.points * episodes, seed=11)
+            found = score(policy)
             means = found.reshape(episodes, settings.points).mean(0)
             grids[name] = {"grid": values.tolist(), "score": means.tolist()}
         count = settings.real_episodes
-        at_real = self._score(policy, Grid(truth[None]), count=count, seed=13)
-        under_prior = self._score(policy, self.task.prior, count=count, seed=17)
+        at_real = Score(self.task, Grid(truth[None]), episodes=count, seed=13)(policy)
+        under_prior = Score(self.task, self.task.prior, episodes=count, seed=17)(policy)
         return {
             "grids": grids,
             "at_real": at_real.mean().item(),
             "under_prior": under_prior.mean().item(),
             "real_episodes": len(at_real),
         }
-
-    def _score(self, policy: Any, source: Any, *, count: int, seed: int) -> Tensor:
-        """Return return or success of ``count`` episodes, the same ones for the same seed."""
-        randomizer = DomainRandomizer(source, seed=seed)
-        env = self.task.make(count, seed=seed, randomizer=randomizer)
-        rule = successes if isinstance(self.task, GoalTask) else evaluate
-        with isolated("robustness", seed):
-            return rule(env, policy, max_steps=self.task.max_steps).float()

@@ -25,6 +25,7 @@ from collectors import collectors
 from fetch_tasks import FETCH, MEASURED, GoalTask, as_preset, with_learner
 from rounds import Journal, compare, describe, draw_pictures, sentence, shown
 from scipy.stats import binomtest
+from scoring import Score
 from tasks import true_parameters
 from torch import Tensor
 from training import Plan, Trained, train
@@ -34,11 +35,10 @@ from torchrl_bayessim import checkpoint
 from torchrl_bayessim.agents.ddpg import DDPG
 from torchrl_bayessim.counts import check_count
 from torchrl_bayessim.errors import message
-from torchrl_bayessim.evaluation import successes
 from torchrl_bayessim.inference.refinement import PosteriorRefinement
 from torchrl_bayessim.influence import check_influence
 from torchrl_bayessim.loop import SimToRealLoop
-from torchrl_bayessim.randomness import isolated, seed_from
+from torchrl_bayessim.randomness import seed_from
 from torchrl_bayessim.robots import SurrogateRobot
 from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.summaries import SummaryStatistics
@@ -73,8 +73,8 @@ def job(settings: Sim2RealFetch, out: Path) -> dict[str, Any]:
     task = chosen(settings)
     truth = true_parameters(task, settings.truth, seed=settings.seed)
     count = 16 if settings.short else 256
-    score = GoalScore(task, Grid(truth[None]), episodes=count, seed=1_000_003)
-    under_prior = GoalScore(task, task.prior, episodes=count, seed=1_000_033)
+    score = Score(task, Grid(truth[None]), episodes=count, seed=1_000_003)
+    under_prior = Score(task, task.prior, episodes=count, seed=1_000_033)
     run = Run(task, truth, settings, out)
     print(f"{settings.task}: {run.learner.name}, {task.prior}")
     resumed = run.loop.resume() if settings.resume else False
@@ -135,30 +135,6 @@ def chosen(settings: Sim2RealFetch) -> GoalTask:
     return replace(task, warmup=warmup, updates=updates)
 
 
-class GoalScore:
-    """Successes under given physics, in the same episodes every time.
-
-    Args:
-        task: The task.
-        source: Physics of the episodes.
-        episodes: Their number; each is an environment of its own.
-        seed: Other than that of training, and of other scores.
-    """
-
-    def __init__(self, task: GoalTask, source: Any, *, episodes: int, seed: int) -> None:
-        self.max_steps, self.seed = task.max_steps, seed
-        self.randomizer = DomainRandomizer(source, seed=seed)
-        self.begun = self.randomizer.get_extra_state()
-        self.env = task.make(episodes, seed=seed, randomizer=self.randomizer)
-
-    def __call__(self, policy: Any) -> Tensor:
-        """Return whether each goal was reached, shape ``(episodes,)``."""
-        self.env.set_seed(self.seed)
-        self.randomizer.set_extra_state(dict(self.begun))
-        with isolated("score"):
-            return successes(self.env, policy, max_steps=self.max_steps).float()
-
-
 class Run:
     """The learner, its environments, and what it is trained for in turn."""
 
@@ -209,7 +185,7 @@ class Run:
         self.collect()
         self.learner.buffer.empty()
 
-    def rounds(self, score: GoalScore, journal: Journal) -> list[dict[str, Any]]:
+    def rounds(self, score: Score, journal: Journal) -> list[dict[str, Any]]:
         """Go through the rounds that are left; return the entries of all."""
         for turn in self.loop:
             real = share(score(self.learner.policy))
@@ -252,7 +228,7 @@ class Run:
             keep_every=50,
             score_every=max(20, batches // 25),  # for the picture only
         )
-        select = GoalScore(self.task, self.task.prior, episodes=64, seed=seed_from(name) % 2**31)
+        select = Score(self.task, self.task.prior, episodes=64, seed=seed_from(name) % 2**31)
         return train(
             self.learner,
             self.env,

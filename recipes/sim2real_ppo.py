@@ -24,6 +24,7 @@ from typing import Any
 import recipe
 from collectors import collectors
 from rounds import Journal, compare, confidence, describe, draw_pictures, sentence, shown
+from scoring import Score
 from tasks import TASKS, Task, true_parameters
 from torch import Tensor
 from torchrl.collectors import Collector
@@ -32,7 +33,6 @@ from workers import workers
 
 from torchrl_bayessim.agents.ppo import PPO
 from torchrl_bayessim.errors import message
-from torchrl_bayessim.evaluation import evaluate
 from torchrl_bayessim.inference.refinement import PosteriorRefinement
 from torchrl_bayessim.influence import without_influence
 from torchrl_bayessim.loop import SimToRealLoop, ended_return
@@ -71,7 +71,8 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
         settings.simulations = min(settings.simulations, 192)
         settings.updates = settings.updates or 2
     truth = true_parameters(task, settings.truth, seed=settings.seed)
-    score = Score(task, truth, episodes=16 if settings.short else 100)
+    count = 16 if settings.short else 100
+    score = Score(task, Grid(truth[None]), episodes=count, seed=1_000_003)
     check_logger(settings.logger)
     shutil.rmtree(out / "log", ignore_errors=True)  # of a broken run, which is logged again
     logger = get_logger(settings.logger, logger_name=str(out), experiment_name="log")
@@ -173,23 +174,6 @@ def idle(task: Task) -> tuple[str, ...]:
     randomizer = DomainRandomizer(task.prior)
     env = task.make(4, seed=0, randomizer=randomizer)
     return without_influence(env, randomizer, task.prior, steps=min(100, task.horizon))
-
-
-class Score:
-    """Returns at the robot; the only code that may see its parameters.
-
-    The same initial states every time, so that two policies are compared in pairs.
-    """
-
-    def __init__(self, task: Task, truth: Tensor, *, episodes: int) -> None:
-        self.max_steps = task.max_steps
-        self.env = task.make(episodes, seed=0, randomizer=DomainRandomizer(Grid(truth[None])))
-
-    def __call__(self, policy: Any) -> Tensor:
-        """Return the return of every episode, shape ``(episodes,)``."""
-        self.env.set_seed(1_000_003)
-        with isolated("score"):
-            return evaluate(self.env, policy, max_steps=self.max_steps)
 
 
 class Baseline:
