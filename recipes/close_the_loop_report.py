@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import recipe
+from intervals import interval
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from sim2real_seeds import interval
 
 SOURCES = ("without", "with")
 _COLOURS = {"without": "#D55E00", "with": "#0072B2"}

@@ -9,7 +9,7 @@ from typing import Any
 
 import recipe
 import torch
-from sim2real_seeds import interval
+from intervals import interval
 
 from torchrl_bayessim import plots
 

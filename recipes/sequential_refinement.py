@@ -21,10 +21,10 @@ from typing import Any
 
 import recipe
 import torch
+from intervals import interval
 from posterior_recovery import Laboratory, chosen
 from recovery_methods import bayessim
 from recovery_problems import PROBLEMS
-from sim2real_seeds import interval
 from tqdm.auto import tqdm
 from workers import workers
 

@@ -23,8 +23,8 @@ from typing import Any
 import recipe
 from collectors import collectors
 from fetch_tasks import FETCH, MEASURED, GoalTask, as_preset, with_learner
+from intervals import share
 from rounds import Journal, compare, describe, draw_pictures, sentence, shown
-from scipy.stats import binomtest
 from scoring import Score
 from tasks import true_parameters
 from torch import Tensor
@@ -239,12 +239,6 @@ class Run:
             label=f"{name} policy",
             progress=self.settings.progress,
         )
-
-
-def share(reached: Tensor) -> tuple[float, list[float]]:
-    """Return the share of successes and its 95 % interval (Wilson 1927)."""
-    low, high = binomtest(int(reached.sum()), len(reached)).proportion_ci(method="wilson")
-    return reached.mean().item(), [low, high]
 
 
 def report(reached: Tensor) -> dict[str, Any]:

@@ -10,7 +10,6 @@ prior. ``resume=FOLDER`` goes on after a break.
 from __future__ import annotations
 
 import json
-import statistics
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import recipe
-from scipy.stats import t as student
+from intervals import interval
 
 from torchrl_bayessim.errors import SimulationError, message
 from torchrl_bayessim.whole_file import write_text
@@ -97,13 +96,6 @@ def one(settings: Seeds, out: Path, seed: int) -> dict[str, Any]:
             raise SimulationError(f"seed {seed} failed: {done.stderr.strip().splitlines()[-1]}")
     run = json.loads(file.read_text())
     return {key: run[key] for key in ("parameters", "true", "rounds", "baseline", "gain")}
-
-
-def interval(values: list[float]) -> dict[str, float]:
-    """Return mean, 95 % Student interval of the mean, and the values."""
-    mean = statistics.fmean(values)
-    half = student.ppf(0.975, len(values) - 1) * statistics.stdev(values) / len(values) ** 0.5
-    return {"mean": mean, "low": mean - half, "high": mean + half, "values": values}
 
 
 def table(result: dict[str, Any]) -> str:
