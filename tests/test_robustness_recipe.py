@@ -133,8 +133,13 @@ def test_intervals_of_shares_end_at_one(run, score, told):
     entry = {"mean": 0.9, "low": 0.8, "high": 1.2, "values": [0.9], "sd": 0.1}
     result = {"task": "t", "algorithm": "a", "seeds": 1, "frames": 1, "score": score, "runs": []}
     result |= {"real_episodes": 1, "parameters": [], "true": [], "posteriors": []}
-    result |= {"at_real": {"prior": entry}, "under_prior": {"prior": entry}}
+    result |= {"at_real": {"prior": entry}, "under_prior": {"prior": entry}, "inference_frames": 0}
     assert told in robustness_report.table(result)
+    assert "besides" not in robustness_report.table(result)
+
+
+def test_what_the_posterior_costs_beside_training_is_told(finished):
+    assert "took 2,400 frames of simulation besides" in (finished / "table.md").read_text()
 
 
 def test_intervals_are_students(run):
