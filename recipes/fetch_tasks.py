@@ -21,6 +21,7 @@ from torchrl_bayessim.agents.ddpg import DDPG
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.envs.tasks.fetch import goal_reward
 from torchrl_bayessim.errors import message
+from torchrl_bayessim.evaluation import successes
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
 from torchrl_bayessim.summaries import cross_correlation, linear_dynamics
@@ -50,6 +51,10 @@ class GoalTask(Task):
     def learner(self, env: EnvBase, **options: Any) -> DDPG:
         """Return an untrained learner."""
         return DDPG(env, goal_reward, **{**self.ddpg, **options})
+
+    def scores(self, env: EnvBase, policy: Any) -> Tensor:
+        """Return 1 for each environment whose goal is reached, 0 for the others."""
+        return successes(env, policy, max_steps=self.max_steps).float()
 
 
 def goal_task(simulator_name: str, **settings: Any) -> GoalTask:

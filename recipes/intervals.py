@@ -16,7 +16,14 @@ def interval(values: list[float]) -> dict[str, float]:
     return {"mean": mean, "low": mean - half, "high": mean + half, "values": values}
 
 
+def wilson(hits: int, n: int) -> tuple[float, float]:
+    """Return the 95 % interval of a proportion (Wilson 1927); all of [0, 1] of no cases."""
+    if not n:
+        return 0.0, 1.0
+    low, high = binomtest(hits, n).proportion_ci(method="wilson")
+    return float(low), float(high)
+
+
 def share(reached: Tensor) -> tuple[float, list[float]]:
-    """Return the share of successes and its 95 % interval (Wilson 1927)."""
-    low, high = binomtest(int(reached.sum()), len(reached)).proportion_ci(method="wilson")
-    return reached.mean().item(), [low, high]
+    """Return the share of successes and its 95 % interval."""
+    return reached.mean().item(), [*wilson(int(reached.sum()), len(reached))]

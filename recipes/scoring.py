@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from fetch_tasks import GoalTask
 from tasks import Task
 from torch import Tensor
 
-from torchrl_bayessim.evaluation import evaluate, successes
 from torchrl_bayessim.randomness import isolated
 from torchrl_bayessim.transforms import DomainRandomizer
 
 
 class Score:
-    """Returns of one policy after another, or whether goals are reached.
+    """Scores of one policy after another, as the task has them: returns, or goals reached.
 
     The initial states, goals and physics are the same for all, so that policies are compared in
     pairs.
@@ -27,15 +25,14 @@ class Score:
     """
 
     def __init__(self, task: Task, source: Any, *, episodes: int, seed: int) -> None:
-        self.max_steps, self.seed = task.max_steps, seed
-        self.rule = successes if isinstance(task, GoalTask) else evaluate
+        self.task, self.seed = task, seed
         self.randomizer = DomainRandomizer(source, seed=seed)
         self.begun = self.randomizer.get_extra_state()
         self.env = task.make(episodes, seed=seed, randomizer=self.randomizer)
 
     def __call__(self, policy: Any) -> Tensor:
-        """Return the return of every episode, or 1 for a goal that was reached and 0 for others."""
+        """Return the score of every episode, shape ``(episodes,)``."""
         self.env.set_seed(self.seed)
         self.randomizer.set_extra_state(dict(self.begun))
         with isolated("score"):
-            return self.rule(self.env, policy, max_steps=self.max_steps).float()
+            return self.task.scores(self.env, policy)

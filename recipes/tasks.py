@@ -20,6 +20,7 @@ from torchrl_bayessim.envs.classic_control.mountain_car import MountainCarContin
 from torchrl_bayessim.envs.classic_control.pendulum import PendulumEnv
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.errors import message
+from torchrl_bayessim.evaluation import evaluate
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.physics.attributes import AttributePhysics
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
@@ -68,6 +69,10 @@ class Task:
             self.simulator(environments, seed),
             Compose(*transforms, StepCounter(self.max_steps), RewardSum()),
         )
+
+    def scores(self, env: EnvBase, policy: Any) -> Tensor:
+        """Return what a policy is worth in one episode of each environment: its return."""
+        return evaluate(env, policy, max_steps=self.max_steps)
 
 
 def true_parameters(task: Any, choice: str, *, seed: int) -> Tensor:

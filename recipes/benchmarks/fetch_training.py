@@ -5,9 +5,9 @@ each episode, fill the hindsight replay buffer, and make as many gradient update
 steps N environments natively, the other a ``SerialEnv`` of N gymnasium environments or, with
 ``processes=2``, a ``ParallelEnv`` of two halves. They take turns, so ratios are within a run. While
 the native one steps in a thread of its own the learner makes its updates; Python simulators leave
-it no time. ``collect`` is the loop without its updates,
-``train`` the whole of it; environment frames per second. Learner and N are those of the recipes'
-task; ``preset=wide`` has larger networks and more updates, as in `fetch_tasks`::
+it no time. ``collect`` is the loop without its updates, ``train`` the whole of it; environment
+frames per second. Learner and N are those of the recipes' task; ``preset=wide`` has larger networks
+and more updates, as in `fetch_tasks`::
 
     python recipes/benchmarks/fetch_training.py [task=fetch_push] [preset=wide] [runs=5]
         [updates=0.2] [n=16] [processes=2] [matmul_precision=medium]
@@ -114,9 +114,9 @@ def main(*arguments: str) -> None:
     torch.set_num_threads(threads)
     torch.set_float32_matmul_precision(given["matmul_precision"])
     asked = {"updates_per_frame": float(given["updates"])} if given["updates"] else {}
+    gymnasiums = partial(gym, processes=counts["processes"])
     cases = {}
     for name, own in {"collect": {"updates_per_frame": 0.0}, "train": asked}.items():
-        gymnasiums = partial(gym, processes=counts["processes"])
         for kind, make in {"": partial(batched, threads=threads), GYM: gymnasiums}.items():
             env = make(task, n)
             learner = task.learner(env, **own)

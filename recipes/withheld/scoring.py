@@ -2,31 +2,21 @@
 
 from __future__ import annotations
 
-__all__ = ["NAMING", "Record", "finite", "record", "scores", "share", "uniform", "wilson"]
+__all__ = ["NAMING", "Record", "finite", "record", "scores", "share", "uniform"]
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
+from intervals import wilson
 from scipy.stats import kstest
 
 from .classes import class_of
 
 Record = dict[str, Any]
-_Z = 1.959963984540054
 NAMING = {"named", "named_partial", "ambiguous"}
 _CHANNELS = {"actuation", "body", "contact", "sensing"}
-
-
-def wilson(hits: int, n: int) -> tuple[float, float]:
-    """Return the 95 % interval of a proportion (Wilson 1927)."""
-    if not n:
-        return 0.0, 1.0
-    p, z2 = hits / n, _Z * _Z
-    centre = (p + z2 / (2 * n)) / (1 + z2 / n)
-    half = _Z / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
-    return max(centre - half, 0.0), min(centre + half, 1.0)
 
 
 def share(hits: Iterable[bool]) -> dict[str, Any]:
