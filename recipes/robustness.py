@@ -60,6 +60,7 @@ COUNTS = {
     "batches": 0,  # 0 for the task's own
     "episodes": 1,
     "simulations": 8,
+    "refinements": 0,
     "points": 1,
     "grid_episodes": 1,
     "real_episodes": 1,
@@ -78,7 +79,9 @@ class Robustness(recipe.Settings):
     algorithm: str = ""  # ddpg or td3; empty for the task's own
     critic_sees_physics: bool | None = None  # of Fetch; None for the task's own
     episodes: int = 8  # real episodes that the posterior is inferred from
-    simulations: int = 512
+    simulations: int = 512  # per refinement of the posterior
+    refinements: int = 0  # 0 for 2 (CartPole) or 1 (Fetch)
+    checkpoint: str = "best"  # under the policy's own physics; or last
     points: int = 10  # of the grid of each parameter, to which the robot is added
     grid_episodes: int = 64  # per point
     real_episodes: int = 256  # at the robot
@@ -113,6 +116,7 @@ def job(settings: Robustness, out: Path) -> dict[str, Any]:
         "true": truth.tolist(),
         "score": "success" if isinstance(task, GoalTask) else "return",
         "seeds": len(seeds),
+        "checkpoint": settings.checkpoint,
         "frames": int(runs[0]["curve"][-1]["frames"]),
         "inference_frames": study.inference_frames if "posterior" in sources else 0,
         "real_episodes": runs[0]["real_episodes"],
@@ -142,6 +146,10 @@ def chosen(settings: Robustness) -> Task:
     settings.setting = settings.setting or available[0]
     if settings.setting not in available:
         raise ValueError(message("a setting", settings.setting, available=available))
+    if settings.checkpoint not in {"best", "last"}:
+        raise ValueError(message("a checkpoint", settings.checkpoint, available=["best", "last"]))
+    # one friction is found at once; a mass at the edge of its prior, once simulations are near it
+    settings.refinements = settings.refinements or (1 if isinstance(task, GoalTask) else 2)
     if isinstance(task, GoalTask):
         task = as_preset(task, settings.setting)
         if settings.short:

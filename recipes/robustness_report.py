@@ -83,7 +83,8 @@ def table(result: dict[str, Any]) -> str:
     lines = [
         f"{result['task']}, {result['algorithm']}, {seeds} seeds, {result['frames']:,} frames per "
         f"policy, {score} in the same {result['real_episodes']} episodes at the robot "
-        f"({', '.join(f'{n} {v:.3g}' for n, v in _truth(result))}){_besides(result)}",
+        f"({', '.join(f'{n} {v:.3g}' for n, v in _truth(result))}){_besides(result)}"
+        f"{_chosen(result)}",
         "",
         f"| trained under | {score} at the robot, mean and 95 % interval over seeds | spread (sd) "
         f"| each seed | {score} under the prior | its own physics first solved after (frames) |",
@@ -114,6 +115,13 @@ def _besides(result: dict[str, Any]) -> str:
     """Return what the posterior costs beside training."""
     frames = result["inference_frames"]
     return f"; the posterior took {frames:,} frames of simulation besides" if frames else ""
+
+
+def _chosen(result: dict[str, Any]) -> str:
+    """Return which of a training's policies was taken; older results do not say."""
+    told = {"best": "each the best of its looks under its own physics", "last": "each the last"}
+    kind = result.get("checkpoint")
+    return f"; policies are {told[kind]}" if kind else ""
 
 
 def _with_interval(entry: dict[str, Any], *, share: bool) -> str:

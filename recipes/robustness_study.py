@@ -19,6 +19,7 @@ from torchrl_bayessim import checkpoint
 from torchrl_bayessim.agents.ppo import PPO
 from torchrl_bayessim.inference.refinement import PosteriorRefinement
 from torchrl_bayessim.influence import check_influence
+from torchrl_bayessim.randomness import seed_from
 from torchrl_bayessim.real_trajectories import comparable
 from torchrl_bayessim.robots import SurrogateRobot
 from torchrl_bayessim.simulate import simulate
@@ -26,10 +27,10 @@ from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.summaries import SummaryStatistics
 from torchrl_bayessim.transforms import DomainRandomizer
 
-SCORED = 10  # times in a training, of which the best is taken
+# Looks at a policy in a training, of which the best is taken: dear where MuJoCo steps
+LOOKS = {"goals": 10, "returns": 20}
 CHOOSING = 256  # episodes: of 15 looks at 64 the best was a lucky one, 0.95 and then 0.86
-# Mean return of the episodes that end in a fortieth of the training (Gymnasium's own mark for
-# CartPole), or success in those episodes
+# Score that counts as solved: a mean return (Gymnasium's own mark for CartPole) or a success
 SOLVED = {"cartpole": 475.0, "fetch_push": 0.9, "fetch_slide": 0.6, "fetch_reach": 0.9}
 
 
@@ -55,7 +56,8 @@ class Study:
     @property
     def inference_frames(self) -> int:
         """Frames that are simulated for the posterior, beside those of training."""
-        return self.settings.simulations * self.settings.episodes * self.steps
+        settings = self.settings
+        return settings.refinements * settings.simulations * settings.episodes * self.steps
 
     def scored(self, source: str) -> dict[str, Any]:
         """Return the scores of the policy trained under ``source``, from its file if it has one."""
@@ -93,12 +95,14 @@ class Study:
         self.randomizer.set_extra_state(self._begun)  # the same first episode for all sources
         goals = isinstance(self.task, GoalTask)
         batches = self.settings.batches or getattr(self.task, "budget", 0)
+        looks = LOOKS["goals" if goals else "returns"]
+        chosen = self.settings.checkpoint == "best" and not self.settings.short
         plan = Plan(
             2 if self.settings.short else batches,
             self.task.horizon,
             file=self.out / f"{source}.pt",
             keep_every=50 if goals else 200,
-            score_every=math.ceil(batches / SCORED) or 1,
+            score_every=math.ceil(batches / looks) or 1,
         )
         return train(
             learner,
@@ -106,7 +110,7 @@ class Study:
             self.randomizer,
             plan,
             key=(self.seed, "robustness"),  # the same for all sources: common random numbers
-            score=self._select(source) if goals and not self.settings.short else None,
+            score=self._select(source) if chosen else None,
             label=f"seed {self.seed}, {source}",
             progress=self.settings.progress,
         )
@@ -136,18 +140,22 @@ class Study:
         observed = statistics.together(comparable(real, horizon=self.steps))
         randomizer = DomainRandomizer(task.prior, seed=self.seed)
         rows = min(64, settings.simulations * settings.episodes)
-        pairs = simulate(
-            task.make(rows, seed=self.seed, randomizer=randomizer),
-            learner.policy,
-            statistics,
-            randomizer,
-            pairs=settings.simulations,
-            max_steps=self.steps,
-            trajectories=settings.episodes,
-            seed=self.seed,
-            progress=settings.progress,
-        )
-        refinement.learn(pairs["theta"], pairs["summary"], observed, key=("robustness",))
+        env = task.make(rows, seed=self.seed, randomizer=randomizer)
+        for turn in range(settings.refinements):
+            randomizer.source = refinement.proposal()
+            pairs = simulate(
+                env,
+                learner.policy,
+                statistics,
+                randomizer,
+                pairs=settings.simulations,
+                max_steps=self.steps,
+                trajectories=settings.episodes,
+                seed=seed_from(self.seed, turn) % 2**31 if turn else self.seed,
+                progress=settings.progress,
+            )
+            key = ("robustness", turn) if turn else ("robustness",)
+            refinement.learn(pairs["theta"], pairs["summary"], observed, key=key)
         checkpoint.save(file, refinement.state_dict())
         return refinement.posterior
 

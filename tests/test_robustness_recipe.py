@@ -6,6 +6,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+
+from torchrl_bayessim import checkpoint
+from torchrl_bayessim.agents.ppo import PPO
+from torchrl_bayessim.sources import Grid
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 TINY = ["short=true", "progress=false", "seeds=2", "points=3"]
@@ -97,6 +102,8 @@ def test_a_policy_trained_after_a_break_is_the_same(finished, run, same_numbers,
         (["real_episodes=0"], "expected real_episodes= to be positive, got 0"),
         (["episodes=0"], "expected episodes= to be positive, got 0"),
         (["simulations=1"], "expected at least 8 simulations=, got 1"),
+        (["refinements=-1"], "expected refinements= not to be negative, got -1"),
+        (["checkpoint=first"], "expected a checkpoint, got 'first'. Available: best, last"),
         (["points=-1"], "expected points= to be positive, got -1"),
         (["seeds=-1"], "expected seeds= not to be negative, got -1"),
         (["task=fetch_push", "batches=-1"], "expected batches= not to be negative, got -1"),
@@ -124,6 +131,57 @@ def test_the_robot_replaces_a_point_of_the_grid_that_is_its_own(run):
     )
     assert curve["grid"] == [0.1, 0.2, 0.3]
     assert curve["return_mean"] == [1.0, 2.0, 9.0]
+
+
+CARTPOLE = ["seeds=1", "batches=3", "simulations=16", "episodes=2", "points=2", "grid_episodes=2"]
+
+
+@pytest.fixture(scope="module")
+def cartpole(run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cartpole")
+    run(*CARTPOLE, "real_episodes=4", "progress=false", f"out={folder}")
+    return json.loads((folder / "result.json").read_text()), folder
+
+
+def test_a_policy_of_cartpole_is_the_best_of_its_looks(cartpole):
+    import robustness
+    import robustness_study
+    from scoring import Score
+
+    result, folder = cartpole
+    (oracle,) = [entry for entry in result["runs"] if entry["source"] == "oracle"]
+    assert [point["frames"] for point in oracle["curve"]] == [256, 512, 768]
+    task = robustness.chosen(robustness.Robustness())
+    looks = Score(
+        task, Grid(torch.tensor([[0.5, 0.1]])), episodes=robustness_study.CHOOSING, seed=7
+    )
+    learner = PPO(task.make(2, seed=0, randomizer=None), **task.ppo)
+    learner.policy.load_state_dict(checkpoint.load(folder / "seed0" / "oracle_policy.pt"))
+    best = max(point["score"] for point in oracle["curve"])
+    assert looks(learner.policy).mean().item() == pytest.approx(best)
+    told = (folder / "table.md").read_text()
+    assert "policies are each the best of its looks under its own physics" in told
+
+
+def test_the_last_policy_can_be_asked_for(run, tmp_path):
+    run(*CARTPOLE, "sources=oracle", "checkpoint=last", "progress=false", f"out={tmp_path}")
+    (oracle,) = json.loads((tmp_path / "result.json").read_text())["runs"]
+    assert all("score" not in point for point in oracle["curve"])
+    assert "policies are each the last" in (tmp_path / "table.md").read_text()
+
+
+def test_cartpoles_posterior_is_refined_once(cartpole, run, tmp_path):
+    result, folder = cartpole
+    assert result["inference_frames"] == 2 * 16 * 2 * 128
+    for name in ("prior.json", "prior_policy.pt"):  # which collects: the same real trajectories
+        (tmp_path / "seed0").mkdir(exist_ok=True)
+        shutil.copy(folder / "seed0" / name, tmp_path / "seed0" / name)
+    sources = ["sources=prior,posterior", "refinements=1", "progress=false"]
+    run(*CARTPOLE, "real_episodes=4", *sources, f"out={tmp_path}")
+    unrefined = json.loads((tmp_path / "result.json").read_text())
+    assert unrefined["inference_frames"] == 16 * 2 * 128
+    first, refined = (found["posteriors"][0]["posterior"] for found in (unrefined, result))
+    assert refined["mean"] != pytest.approx(first["mean"], rel=1e-3)
 
 
 @pytest.mark.parametrize(("score", "told"), [("success", "0.9 [0.8, 1]"), ("return", "[0.8, 1.2]")])
