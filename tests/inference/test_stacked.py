@@ -340,18 +340,21 @@ def test_a_fit_leaves_no_gradients(features):
 def test_a_contrast_belongs_to_its_factor_and_pickles_of_before_have_none():
     net = posteriors()[0].network
     net.contrast.fill_(1.5)
+    net.tails = torch.tensor([0.5])
     some = {key: value for key, value in net.state_dict().items() if key.startswith("features")}
     net.load_state_dict(some, strict=False)
     assert net.contrast.tolist() == [1.5, 1.5]
-    del net._buffers["contrast"]
+    assert net.tails == 0.5
+    del net._buffers["contrast"], net._buffers["tails"]
     again = pickle.loads(pickle.dumps(net))
     assert again.contrast.tolist() == [1.0, 1.0]
+    assert len(again.tails) == 0
 
 
 def test_no_contrast_makes_a_point_of_a_component():
     net = posteriors()[0].network
     raw = torch.full((1, sum(net.sizes)), -60.0)
-    mixture = net.widened(raw, torch.ones(2), torch.full((2,), 2.0))
+    mixture = net.widened(raw, torch.ones(2), torch.full((2,), 2.0), torch.zeros(0))
     assert mixture.scale_tril.norm(dim=-1).min().item() == pytest.approx(1e-4, rel=1e-3)
 
 
@@ -359,8 +362,11 @@ def test_states_of_one_factor_for_all_parameters_are_understood():
     net = posteriors()[0]
     state = net.state_dict()
     name = next(key for key in state if key.endswith("widening"))
-    older = {key: value for key, value in state.items() if not key.endswith("contrast")}
+    newer = ("contrast", "tails")
+    older = {key: value for key, value in state.items() if not key.endswith(newer)}
     net.network.contrast.fill_(1.5)
+    net.network.tails = torch.tensor([0.5])
     net.load_state_dict(older | {name: torch.tensor(1.25)})
     assert net.network.widening.tolist() == [1.25, 1.25]
     assert net.network.contrast.tolist() == [1.0, 1.0]
+    assert len(net.network.tails) == 0

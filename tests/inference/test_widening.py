@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_bayessim.inference.ensemble import fit_together
+from torchrl_bayessim.inference.fit import fit
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
 from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
@@ -117,6 +118,55 @@ def test_a_network_alone_keeps_the_contrast_that_it_has():
     network = discerning()
     widen([network], told_apart(1.5))
     assert network.network.contrast.item() == 1.0
+
+
+def heavy(ratio, count=4000):
+    """Return pairs of which one in five deviates so many times more than the others."""
+    pairs = held_out(count)
+    pairs["theta"][::5] *= ratio
+    return pairs
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.5, 2.5])
+def test_an_average_learns_how_heavy_the_tails_of_its_errors_are(ratio):
+    networks = [sure(DEVIATION), sure(DEVIATION)]
+    pairs = heavy(ratio)
+    widen(networks, pairs)
+    for network in networks:
+        if ratio > 1:
+            assert network.network.tails.exp().item() == pytest.approx(ratio, rel=0.1)
+        else:
+            assert network.network.tails.exp().item() < 1.25
+        q = network.distribution(torch.zeros(1))
+        deviation = pairs["theta"].std().item()
+        assert q.stddev.item() == pytest.approx(deviation, rel=0.03)  # tails do not change it
+        for share in (0.5, 0.9):
+            draws = q.sample((20_000,), generator=generator("draws")).abs().quantile(share)
+            covered = (pairs["theta"].abs() < draws).float().mean().item()
+            assert covered == pytest.approx(share, abs=0.02)
+
+
+def test_a_state_brings_its_tails_and_a_fit_begins_without():
+    network, other = sure(DEVIATION), sure(DEVIATION)
+    widen([network, other], heavy(2.5))
+    again = sure(2 * DEVIATION)
+    again.load_state_dict(network.state_dict())
+    mixture = again.distribution(torch.zeros(1)).mixture
+    expected = network.distribution(torch.zeros(1)).mixture
+    torch.testing.assert_close(mixture.logits, expected.logits)
+    torch.testing.assert_close(mixture.scale_tril, expected.scale_tril)
+    again.load_state_dict(sure(DEVIATION).state_dict())
+    assert len(again.network.tails) == 0
+    pairs = held_out(100)
+    fit(network, pairs.set("summary", pairs["theta"]), epochs=1, progress=False)
+    assert len(network.network.tails) == 0
+
+
+def test_a_network_alone_keeps_gaussian_components():
+    network = sure(DEVIATION)
+    widen([network], heavy(2.5))
+    assert len(network.network.tails) == 0
+    assert network.distribution(torch.zeros(1)).mixture.logits.shape == (1,)
 
 
 def test_a_few_pairs_move_the_factor_less_than_many():

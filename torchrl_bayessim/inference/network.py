@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-__all__ = ["Covariance", "MixtureDensityNetwork", "factor", "melu"]
+__all__ = ["Covariance", "MixtureDensityNetwork", "factor", "heavy_tailed", "melu"]
 
+import math
 from collections.abc import Iterable
 from typing import Any, Literal
 
@@ -22,6 +23,7 @@ WIDEST = 4.0  # of a component, in prior deviations: nearly flat over a box, whi
 STEEPEST = 100.0  # ratio of a marginal to a conditional deviation
 LINEAR = 3.0  # deviations within which compression changes little
 _FARTHEST = 1e6  # deviations of an input: one far out says no more than that
+_WIDER = 0.2  # weight of the wider of two components that stand for one
 FLOOR = 1e-8  # of a variance, in standardised coordinates: a deviation of 1e-4 prior deviations
 
 
@@ -56,6 +58,7 @@ class MixtureDensityNetwork(nn.Module):
     scale: Tensor
     widening: Tensor  # factor on each parameter's deviations that a fit ends with, shape (D,)
     contrast: Tensor  # power to which they are raised before that, shape (D,)
+    tails: Tensor  # logarithm of the ratio of :func:`heavy_tailed`, shape (1,), or (0,) for none
 
     def __init__(
         self,
@@ -90,6 +93,7 @@ class MixtureDensityNetwork(nn.Module):
         self.register_buffer("scale", torch.ones(features.dim))
         self.register_buffer("widening", torch.ones(parameters))
         self.register_buffer("contrast", torch.ones(parameters))
+        self.register_buffer("tails", torch.zeros(0))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         widening = state_dict.get(f"{prefix}widening")
@@ -98,13 +102,17 @@ class MixtureDensityNetwork(nn.Module):
                 widening = state_dict[f"{prefix}widening"] = widening.expand_as(self.widening)
             # of before: none
             state_dict.setdefault(f"{prefix}contrast", torch.ones_like(widening))
+            tails = state_dict.setdefault(f"{prefix}tails", widening.new_zeros(0))
+            self.tails = self.tails.new_zeros(len(tails))
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take a pickled network; those of before have no contrast."""
+        """Take a pickled network; those of before have no contrast, or no tails."""
         super().__setstate__(state)
         if "contrast" not in self._buffers:
             self.register_buffer("contrast", torch.ones_like(self.widening))
+        if "tails" not in self._buffers:
+            self.register_buffer("tails", self.widening.new_zeros(0))
 
     def standardize_inputs(self, summaries: Tensor | Iterable[Tensor]) -> InputScaling:
         """Set the input scaling from training summaries ``(N, L)``, or from parts of them.
@@ -133,7 +141,8 @@ class MixtureDensityNetwork(nn.Module):
 
     def forward(self, summary: Tensor) -> Mixture:
         """Return the mixture for summaries ``(*, L)``."""
-        return self.widened(self.raw(self.scaled(summary)), self.widening, self.contrast)
+        raw = self.raw(self.scaled(summary))
+        return self.widened(raw, self.widening, self.contrast, self.tails)
 
     def raw(self, scaled: Tensor) -> Tensor:
         """Return the last layer's values for what :meth:`scaled` made of summaries, ``(*, L)``.
@@ -142,16 +151,22 @@ class MixtureDensityNetwork(nn.Module):
         """
         return self.head(self.features(scaled))
 
-    def widened(self, raw: Tensor, widening: Tensor, contrast: Tensor) -> Mixture:
-        """Return the mixture of :meth:`raw` values, wider or narrower.
+    def widened(self, raw: Tensor, widening: Tensor, contrast: Tensor, tails: Tensor) -> Mixture:
+        """Return the mixture of :meth:`raw` values, wider or narrower, or of heavier tails.
 
         Args:
             raw: Values of the last layer, shape ``(*, P)``.
             widening: Factor on each parameter's deviations, shape ``(D,)``.
             contrast: Power to which they are raised before, in prior deviations, shape ``(D,)``.
+            tails: Logarithm of the ratio of :func:`heavy_tailed`, shape ``(1,)``; ``(0,)`` leaves
+                Gaussian components.
         """
         logits, loc, deviation, slope = self.parts(raw)
-        deviation = (widening * deviation**contrast).clamp(min=FLOOR**0.5)
+        deviation = widening * deviation**contrast
+        if len(tails):
+            logits, deviation = heavy_tailed(logits, deviation, tails.exp())
+            loc, slope = torch.cat([loc, loc], -2), torch.cat([slope, slope], -2)
+        deviation = deviation.clamp(min=FLOOR**0.5)
         deviation = WIDEST * torch.tanh(deviation / WIDEST)
         return Mixture(logits, loc, factor(deviation, slope))
 
@@ -167,6 +182,35 @@ class MixtureDensityNetwork(nn.Module):
         deviation = melu(diagonal.reshape(*each, self.parameters_)).sqrt()
         slope = slope.reshape(*each, self.sizes[-1] // self.components)
         return logits, loc, deviation, STEEPEST * torch.tanh(slope / STEEPEST)
+
+
+def heavy_tailed(logits: Tensor, deviation: Tensor, ratio: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Return two components for each, of the same means and the same variance together.
+
+    .. math::
+        N(\mu, \sigma^2) \to (1 - w)\, N(\mu, a^2 \sigma^2) + w\, N(\mu, a^2 r^2 \sigma^2),
+        \quad a^2 (1 - w + w r^2) = 1,
+
+    with w = 0.2: a narrower middle and heavier tails the larger the ratio r is than 1.
+
+    Args:
+        logits: Shape ``(*, K)``.
+        deviation: Shape ``(*, K, D)``.
+        ratio: r, shape ``()`` or ``(1,)``.
+
+    Returns:
+        Logits ``(*, 2 K)`` and deviations ``(*, 2 K, D)``, the narrow ones first.
+
+    Example:
+        >>> logits, deviation = heavy_tailed(torch.zeros(1), torch.ones(1, 1), torch.tensor(2.0))
+        >>> deviation.flatten()
+        tensor([0.7906, 1.5811])
+        >>> logits.exp()
+        tensor([0.8000, 0.2000])
+    """
+    narrow = (1 - _WIDER + _WIDER * ratio.square()).rsqrt()
+    logits = torch.cat([logits + math.log1p(-_WIDER), logits + math.log(_WIDER)], -1)
+    return logits, torch.cat([narrow * deviation, narrow * ratio * deviation], -2)
 
 
 def factor(deviation: Tensor, slope: Tensor) -> Tensor:
