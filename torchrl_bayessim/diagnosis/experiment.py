@@ -142,7 +142,7 @@ def _runs(
     limited = model.actuator_ctrllimited.astype(bool)
     least = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf)
     most = np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
-    found = []
+    names, waves = [], []
     for amplitude in _AMPLITUDES:
         middle, half = (low + high) / 2, amplitude * (high - low) / 2
         library = excitations(
@@ -152,18 +152,22 @@ def _runs(
             dt=dt,
             generator=generator,
         )
-        for name, wave in library.items():
-            log = _played(prepared, wave, point)
-            if log is not None:
-                label = f"{name}, {amplitude:.0%} of the recorded commands"
-                found.append((label.replace("%", " %"), log))
-    return found
+        names += [
+            f"{name}, {amplitude:.0%} of the recorded commands".replace("%", " %")
+            for name in library
+        ]
+        waves += library.values()
+    return [
+        (name, log)
+        for name, log in zip(names, _played(prepared, waves, point), strict=True)
+        if not _leaves(prepared, log.qpos.numpy())
+    ]
 
 
-def _played(prepared: Prepared, commands: Array, point: Point) -> Log | None:
-    """Return the run from where the first log began, nothing if it leaves what is known."""
+def _played(prepared: Prepared, waves: Sequence[Array], point: Point) -> list[Log]:
+    """Return the runs of commands from where the first log began, all simulated at once."""
     first = prepared.logs["train"][0]
-    count = len(commands)
+    count = len(waves[0])
     robot, predictor = prepared.predictor.system.robot, prepared.predictor
     known = first.uncertainty
     rest = replace(
@@ -172,23 +176,28 @@ def _played(prepared: Prepared, commands: Array, point: Point) -> Log | None:
         time=torch.arange(count, dtype=torch.float64) * predictor.system.control_dt,
         qpos=first.qpos[:1].repeat(count, 1),
         qvel=torch.zeros(count, first.qvel.shape[1], dtype=torch.float64),
-        ctrl=torch.from_numpy(commands),
         first_row=0,
         uncertainty=None if known is None else known.mean(0, keepdim=True).expand(count, -1, -1),
         touching=None,
     )
-    whole = cut([rest], count - 1, history=prepared.sets["train"].segments.history)
+    logs = [replace(rest, ctrl=torch.from_numpy(wave)) for wave in waves]
+    whole = cut(logs, count - 1, history=prepared.sets["train"].segments.history)
     theta = prepared.sets["train"].theta(point.z[None])
     qpos, qvel = predictor.states(whole, theta, strengths_of([point], robot))
-    positions = np.concatenate([rest.qpos[:1].numpy(), qpos[0, 0]])
-    if not np.isfinite(positions).all() or _leaves(prepared, positions):
-        return None
-    velocities = np.concatenate([rest.qvel[:1].numpy(), qvel[0, 0]])
-    return replace(rest, qpos=torch.from_numpy(positions), qvel=torch.from_numpy(velocities))
+    return [
+        replace(
+            log,
+            qpos=torch.cat([rest.qpos[:1], torch.from_numpy(positions)]),
+            qvel=torch.cat([rest.qvel[:1], torch.from_numpy(velocities)]),
+        )
+        for log, positions, velocities in zip(logs, qpos[0], qvel[0], strict=True)
+    ]
 
 
 def _leaves(prepared: Prepared, positions: Array) -> bool:
-    """Return whether a hinge or slide goes far beyond where it has been."""
+    """Return whether a run diverges, or a hinge or slide goes far beyond where it has been."""
+    if not np.isfinite(positions).all():
+        return True
     joints = list(prepared.predictor.system.robot.qpos_index)
     seen = torch.cat([log.qpos for log in prepared.logs["train"]]).numpy()[:, joints]
     low, high = seen.min(0), seen.max(0)
