@@ -14,7 +14,7 @@ seed, with its Student interval. Episodes by which a checkpoint is chosen are ot
 CartPole's PPO has two settings, ``paper``, that of rl-zoo, which the paper used, and ``strong``, of
 a longer view; DDPG's on Fetch are ``fast``, ``wide``, larger networks and more updates for Push, as
 older results have it, and ``paper``, the original budget. Writes result.json, table.md and a
-picture per parameter; ``resume=FOLDER`` goes on.
+picture per parameter, and films the first seed's policies; ``resume=FOLDER`` goes on.
 """
 
 from __future__ import annotations
@@ -85,16 +85,18 @@ class Robustness(recipe.Settings):
     points: int = 10  # of the grid of each parameter, to which the robot is added
     grid_episodes: int = 64  # per point
     real_episodes: int = 256  # at the robot
+    video: bool = True  # of the first seed's policies at the robot
     short: bool = False
     resume: str = ""
 
 
 def job(settings: Robustness, out: Path) -> dict[str, Any]:
     """Train every policy, score all, compare and draw."""
+    settings = replace(settings)  # what is chosen below is not what the user said
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     task = chosen(settings)
     if settings.short:
-        settings.simulations, settings.episodes = 24, 2
+        settings.simulations, settings.episodes, settings.checkpoint = 24, 2, "last"
         settings.grid_episodes, settings.real_episodes = 2, 8
     truth = torch.tensor([task.truth[name] for name in task.prior.names])
     sources = chosen_sources(settings, truth, nominal(task))

@@ -99,6 +99,7 @@ def table(result: dict[str, Any]) -> str:
         other = f"{_with_interval(elsewhere, share=share)}: {_each(elsewhere)}"
         cells = source, _with_interval(entry, share=share), spread, _each(entry), other, when
         lines.append(f"| {' | '.join(cells)} |")
+    lines += ["", _common(result)]
     told = [run["posterior"] for run in result["posteriors"]]
     if told:
         lines += ["", "| seed | posterior, mean ± sd | nats over the prior |", "|---|---|---|"]
@@ -109,6 +110,16 @@ def table(result: dict[str, Any]) -> str:
         cell = ", ".join(f"{name} {mean:.3g} ± {sd:.2g}" for name, mean, sd in moments)
         lines.append(f"| {run['seed']} | {cell} | {run['posterior']['nats_over_prior']:+.1f} |")
     return "\n".join(lines) + "\n"
+
+
+def _common(result: dict[str, Any]) -> str:
+    """Return what intervals over seeds leave out."""
+    text = "Intervals are over seeds. All policies are scored in the same episodes"
+    if result["score"] != "success":
+        return f"{text}: other episodes would move them together."
+    shares = [run["at_real"] for run in result["runs"]] or [0.0]
+    error = max((p * (1 - p) / result["real_episodes"]) ** 0.5 for p in shares)
+    return f"{text}: others would move them together, by a standard error of {error:.3f} at most."
 
 
 def _besides(result: dict[str, Any]) -> str:

@@ -14,9 +14,11 @@ from scoring import Score
 from tasks import Task
 from torch import Tensor
 from training import Plan, first_solved, thinned, train
+from video import record
 
 from torchrl_bayessim import checkpoint
 from torchrl_bayessim.agents.ppo import PPO
+from torchrl_bayessim.errors import message
 from torchrl_bayessim.inference.refinement import PosteriorRefinement
 from torchrl_bayessim.influence import check_influence
 from torchrl_bayessim.randomness import seed_from
@@ -27,6 +29,20 @@ from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.summaries import SummaryStatistics
 from torchrl_bayessim.transforms import DomainRandomizer
 
+# Settings without which a policy's file would hold others, and those of its posterior
+MADE_BY = (
+    "task",
+    "setting",
+    "critic_sees_physics",
+    "batches",
+    "checkpoint",
+    "points",
+    "grid_episodes",
+    "real_episodes",
+    "short",
+)
+INFERRED_BY = ("episodes", "simulations", "refinements")
+EPISODES = 4  # on film
 # Looks at a policy in a training, of which the best is taken: dear where MuJoCo steps
 LOOKS = {"goals": 10, "returns": 20}
 CHOOSING = 256  # episodes: of 15 looks at 64 the best was a lucky one, 0.95 and then 0.86
@@ -61,7 +77,14 @@ class Study:
 
     def scored(self, source: str) -> dict[str, Any]:
         """Return the scores of the policy trained under ``source``, from its file if it has one."""
-        found = recipe.kept(self.out / f"{source}.json", lambda: self._made(source))
+        file = self.out / f"{source}.json"
+        found = recipe.kept(file, lambda: self._made(source))
+        self._check_made_by(found.get("made_by"), source, file)
+        if "at_real" not in found:
+            hint = "delete the file, and the policy is trained again"
+            raise ValueError(
+                message("the scores of a policy", f"{file}: {sorted(found)}", hint=hint)
+            )
         replayed = self.out / f"{source}.pt"  # a hundred megabytes
         replayed.unlink(missing_ok=True)
         return found
@@ -71,7 +94,24 @@ class Study:
         start = time.monotonic()
         found = self._scored(source)
         seconds = time.monotonic() - start
-        return found | {"provenance": recipe.provenance(self.settings, seconds=seconds)}
+        provenance = recipe.provenance(self.settings, seconds=seconds)
+        return found | {"made_by": self._made_by(source), "provenance": provenance}
+
+    def _made_by(self, source: str) -> dict[str, Any]:
+        """Return what else would make other scores."""
+        names = MADE_BY + (INFERRED_BY if source == "posterior" else ())
+        named = {name: getattr(self.settings, name) for name in names}
+        return {"source": source, "seed": self.seed, "algorithm": self.algorithm, **named}
+
+    def _check_made_by(self, found: Any, source: str, file: Path) -> None:
+        """Refuse what another run has made; older files, which do not say, are let pass."""
+        if found is None:
+            return
+        for name, asked in self._made_by(source).items():
+            if found.get(name) != asked:
+                expected, got = f"{file} of a run with {name}={asked}", found.get(name)
+                hint = "another out=, or the settings of the run that wrote it"
+                raise ValueError(message(expected, got, hint=hint))
 
     def _scored(self, source: str) -> dict[str, Any]:
         learner = self._learner()
@@ -80,6 +120,10 @@ class Study:
         checkpoint.save(self.out / f"{source}_policy.pt", trained.best)
         found = self._scores(learner.policy) | {"posterior": self._posterior_moments(source)}
         shown = thinned(trained.curve, 40)
+        if self.settings.video and self.seed == self.settings.seed:
+            film = self.out / f"{source}.gif"
+            made = record(self.task, learner.policy, self.truth, film, episodes=EPISODES)
+            found["video"] = made and f"{self.out.name}/{film.name}"
         found["solved"] = first_solved(shown, SOLVED[self.settings.task])
         names = ("frames", "return", "score", "seconds", "cpu_seconds")
         found["curve"] = [{name: p[name] for name in names if name in p} for p in shown]
@@ -96,7 +140,7 @@ class Study:
         goals = isinstance(self.task, GoalTask)
         batches = self.settings.batches or getattr(self.task, "budget", 0)
         looks = LOOKS["goals" if goals else "returns"]
-        chosen = self.settings.checkpoint == "best" and not self.settings.short
+        chosen = self.settings.checkpoint == "best"
         plan = Plan(
             2 if self.settings.short else batches,
             self.task.horizon,
@@ -127,7 +171,9 @@ class Study:
         refinement = self._refinement()
         file = self.out / "posterior_state.pt"
         if file.exists():
-            refinement.load_state_dict(checkpoint.load(file))
+            state = checkpoint.load(file)
+            self._check_made_by(state.get("made_by"), "posterior", file)
+            refinement.load_state_dict(state)
             return refinement.posterior
         task, settings = self.task, self.settings
         learner = self._learner()
@@ -156,7 +202,8 @@ class Study:
             )
             key = ("robustness", turn) if turn else ("robustness",)
             refinement.learn(pairs["theta"], pairs["summary"], observed, key=key)
-        checkpoint.save(file, refinement.state_dict())
+        made_by = {"made_by": self._made_by("posterior")}
+        checkpoint.save(file, refinement.state_dict() | made_by)
         return refinement.posterior
 
     def _refinement(self) -> PosteriorRefinement:

@@ -5,7 +5,8 @@
 A surrogate robot has parameters that only the final score may see. Three rounds: the robot runs
 the policy; a posterior over its parameters is inferred from those episodes; PPO goes on under that
 posterior. The same PPO under the prior, with as many frames, is the baseline. Writes result.json,
-pictures, learning curves and a checkpoint; ``resume=FOLDER`` goes on after a break.
+pictures, learning curves, a film where rendering is possible, and a checkpoint; ``resume=FOLDER``
+goes on after a break.
 ``collector=ray`` simulates the loop on Ray, by default in two workers on this machine.
 """
 
@@ -29,6 +30,7 @@ from tasks import TASKS, Task, true_parameters
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.record.loggers import get_logger
+from video import record
 from workers import workers
 
 from torchrl_bayessim.agents.ppo import PPO
@@ -59,6 +61,7 @@ class Sim2Real(recipe.Settings):
     baseline: bool = True  # also train under the prior, with as many frames
     collector: str = "direct"  # or "ray": the loop simulates in Ray's workers
     workers: int = 2  # of Ray
+    video: bool = True
     short: bool = False  # a smoke test: everything runs, little is learned
     logger: str = "csv"  # or tensorboard, wandb, mlflow
     resume: str = ""  # folder of a run that was broken off
@@ -98,6 +101,9 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
             "rounds": [{k: v for k, v in entry.items() if k != "curve"} for entry in done.rounds],
             "checkpoint": out / "checkpoint.pt",
         }
+        if settings.video:
+            film = out / "posterior.gif"
+            result["video"] = record(task, learner.policy, truth, film, episodes=1)
         curves = {"posterior": [point for entry in done.rounds for point in entry["curve"]]}
         if settings.baseline:
             returns = score(learner.policy)

@@ -46,6 +46,7 @@ class Task:
         shared_batches: Batches per round that serve inference and the learner.
         ppo: PPO's settings.
         summaries: Statistics of trajectories.
+        simulator_name: Gymnasium's name of the simulator, which renders it; empty if none does.
     """
 
     simulator: Callable[[int, int], EnvBase]
@@ -59,6 +60,7 @@ class Task:
     shared_batches: int = 3
     ppo: Mapping[str, Any] = field(default_factory=dict)
     summaries: Sequence[Summary] = (linear_dynamics, duration)
+    simulator_name: str = ""
 
     def make(self, environments: int, *, seed: int, randomizer: DomainRandomizer | None) -> EnvBase:
         """Return the simulator with the physics, and with the randomizer if one is given."""
@@ -102,12 +104,14 @@ TASKS: dict[str, Task] = {
         truth={"length": 0.5, "masspole": 0.1},
         physics=lambda: AttributePhysics("length", "masspole"),
         max_steps=500,
+        simulator_name="CartPole-v1",
     ),
     "pendulum": Task(
         simulator=lambda n, seed: PendulumEnv(n, seed=seed),
         prior=BoxPrior({"dt": (0.01, 0.3)}, units={"dt": "s"}),
         truth={"dt": 0.05},
         physics=lambda: AttributePhysics("dt"),
+        simulator_name="Pendulum-v1",
         max_steps=200,
         environments=64,
         horizon=100,
@@ -119,6 +123,7 @@ TASKS: dict[str, Task] = {
         prior=BoxPrior({"power": (0.0005, 0.1)}, log=["power"]),
         truth={"power": 0.0015},
         physics=lambda: AttributePhysics("power"),
+        simulator_name="MountainCarContinuous-v0",
         max_steps=999,
         environments=32,
         horizon=256,
@@ -146,6 +151,7 @@ TASKS: dict[str, Task] = {
         physics=lambda: AttributePhysics(
             "LINK_MASS_1", "LINK_MASS_2", "LINK_LENGTH_1", "LINK_LENGTH_2"
         ),
+        simulator_name="Acrobot-v1",
         max_steps=500,
         environments=64,
         ppo={"reward_scale": 0.1},
@@ -161,6 +167,7 @@ TASKS: dict[str, Task] = {
             friction=("geom_friction[floor,0]", "geom_friction[foot_geom,0]"),
         ),
         max_steps=1000,
+        simulator_name="Hopper-v5",
         environments=64,
         updates=24,
         shared_batches=2,

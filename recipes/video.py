@@ -1,4 +1,4 @@
-"""A policy on film: gymnasium-robotics renders, TorchRL's recorder records, Pillow writes a GIF."""
+"""A policy on film: Gymnasium renders, TorchRL's recorder records, Pillow writes a GIF."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 import gymnasium_robotics
 import torch
-from fetch_tasks import GoalTask
+from tasks import Task
 from torch import Tensor
 from torchrl.envs import Compose, DoubleToFloat, GymEnv, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -21,13 +21,20 @@ from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
 from torchrl_bayessim.whole_file import replacing
 
+LONGEST = 250  # steps of an episode
+
 
 class GifLogger(Logger):
-    """Keeps what `VideoRecorder` hands on as a GIF; TorchRL's own loggers need more packages."""
+    """Keeps what `VideoRecorder` hands on as a GIF; TorchRL's own loggers need more packages.
 
-    def __init__(self, path: Path) -> None:
+    Args:
+        path: The file.
+        size: Pixels of the longer side at most.
+    """
+
+    def __init__(self, path: Path, *, size: int) -> None:
         super().__init__(exp_name=path.stem, log_dir=str(path.parent))
-        self.path = path
+        self.path, self.size = path, size
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **_: Any) -> None:
         """Write a video of shape ``(1, T, 3, H, W)``, uint8, 25 pictures a second."""
@@ -35,6 +42,8 @@ class GifLogger(Logger):
 
         del name, step
         frames = [Image.fromarray(f.permute(1, 2, 0).numpy()) for f in video[0]]
+        for frame in frames:
+            frame.thumbnail((self.size, self.size))
         first, *others = [f.quantize(64) for f in frames]
         looped = {"save_all": True, "append_images": others, "duration": 40, "loop": 0}
         with replacing(self.path) as file:
@@ -50,9 +59,14 @@ class GifLogger(Logger):
 
 
 def record(
-    task: GoalTask, policy: Any, theta: Tensor, path: Path, *, episodes: int, size: int = 240
+    task: Task, policy: Any, theta: Tensor, path: Path, *, episodes: int, size: int = 240
 ) -> str | None:
-    """Film episodes at given physics; return the file, or None where nothing can be rendered."""
+    """Film episodes at given physics; return the file, or None where nothing can be rendered.
+
+    Of long episodes the first 250 steps are filmed.
+    """
+    if not task.simulator_name:
+        return None
     os.environ.setdefault("MUJOCO_GL", "egl")
     gymnasium.register_envs(gymnasium_robotics)
     try:
@@ -63,21 +77,21 @@ def record(
     return str(path)
 
 
-def _film(
-    task: GoalTask, policy: Any, theta: Tensor, path: Path, *, episodes: int, size: int
-) -> None:
+def _film(task: Task, policy: Any, theta: Tensor, path: Path, *, episodes: int, size: int) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        name, shape = task.simulator_name, {"width": size, "height": size}
-        filmed = GymEnv(name, from_pixels=True, pixels_only=False, **shape)
-    recorder = VideoRecorder(GifLogger(path), tag=path.stem, skip=1)
+        name, options = task.simulator_name, {"from_pixels": True, "pixels_only": False}
+        if "Fetch" in name:  # whose own size takes long to draw
+            options |= {"width": size, "height": size}
+        filmed = GymEnv(name, **options)
+    recorder = VideoRecorder(GifLogger(path, size=size), tag=path.stem, skip=1)
     physics = ApplyPhysics(task.physics()), DomainRandomizer(Grid(theta[None]))
     env = TransformedEnv(filmed, Compose(*physics, DoubleToFloat(), recorder))
     try:
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             env.set_seed(0)
             for _ in range(episodes):
-                env.rollout(task.max_steps, policy)
+                env.rollout(min(task.max_steps, LONGEST), policy)
         recorder.dump()
     finally:
         env.close()

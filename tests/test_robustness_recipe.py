@@ -5,6 +5,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,7 +14,7 @@ from torchrl_bayessim.agents.ppo import PPO
 from torchrl_bayessim.sources import Grid
 
 RECIPES = Path(__file__).parent.parent / "recipes"
-TINY = ["short=true", "progress=false", "seeds=2", "points=3"]
+TINY = ["short=true", "progress=false", "seeds=2", "points=3", "video=false"]
 SOURCES = ["task=fetch_reach", "sources=prior,posterior,oracle"]
 
 
@@ -196,6 +197,22 @@ def test_intervals_of_shares_end_at_one(run, score, told):
     assert "besides" not in robustness_report.table(result)
 
 
+def test_a_short_run_says_that_its_policies_are_the_last(finished):
+    assert json.loads((finished / "result.json").read_text())["checkpoint"] == "last"
+    assert "policies are each the last" in (finished / "table.md").read_text()
+
+
+def test_a_table_says_what_its_intervals_leave_out(finished, cartpole):
+    runs = json.loads((finished / "result.json").read_text())["runs"]
+    error = max((p * (1 - p) / 8) ** 0.5 for p in (entry["at_real"] for entry in runs))
+    assert f"by a standard error of {error:.3f} at most" in (finished / "table.md").read_text()
+    assert "other episodes would move them together" in (cartpole[1] / "table.md").read_text()
+
+
+def test_a_finished_run_takes_the_users_own_words_again(finished, run):
+    run(f"resume={finished}", "points=3", "simulations=512", "progress=false")
+
+
 def test_what_the_posterior_costs_beside_training_is_told(finished):
     assert "took 2,400 frames of simulation besides" in (finished / "table.md").read_text()
 
@@ -214,6 +231,113 @@ def test_intervals_are_students(run):
     assert elsewhere["posterior minus prior"]["values"] == [-2, -1, -3]
     # mean 2, standard deviation 1, and the 97.5 % quantile of t with 2 degrees of freedom, 4.3027
     assert found["high"] - found["mean"] == pytest.approx(4.3027 / 3**0.5, rel=1e-4)
+
+
+def a_study(folder, **settings):
+    import robustness
+    from robustness_study import Study
+
+    small = {"short": True, "progress": False, "video": False, "points": 2, "real_episodes": 8}
+    given = robustness.Robustness(**(small | {"grid_episodes": 2} | settings))
+    task = robustness.chosen(given)
+    given.refinements, given.simulations, given.episodes = 1, 16, 2
+    truth = torch.tensor([task.truth[name] for name in task.prior.names])
+    return Study(task, truth, given, folder, seed=0)
+
+
+def test_a_policy_is_trained_under_the_source_that_its_name_says(run, tmp_path):
+    del run
+    study = a_study(tmp_path)
+    trained_under = {}
+    for source in ("prior", "posterior", "oracle", "nominal"):
+        study.scored(source)
+        trained_under[source] = study.env.reset()["theta"]  # the last of its episodes
+    assert study.task.prior.log_prob(trained_under["prior"]).isfinite().all()
+    assert trained_under["prior"].std(0).min() > 0.3  # all of the box
+    for source in ("oracle", "nominal"):
+        assert (trained_under[source] == torch.tensor([0.5, 0.1])).all()
+    moments = json.loads((tmp_path / "posterior.json").read_text())["posterior"]
+    away = trained_under["posterior"].mean(0) - torch.tensor(moments["mean"])
+    spread = torch.tensor(moments["sd"]) / len(trained_under["posterior"]) ** 0.5
+    assert (away.abs() < 4 * spread).all()
+    assert trained_under["posterior"].unique(dim=0).shape[0] > 1
+
+
+def test_scores_stand_at_their_own_point_of_the_grid(run, tmp_path):
+    """Of a task whose score tells its physics, every score is known."""
+    del run
+    from tasks import Task
+
+    class Told(Task):
+        def scores(self, env, policy):
+            del policy
+            return env.reset()["theta"] @ torch.tensor([1.0, 100.0])
+
+    study = a_study(tmp_path, points=4, grid_episodes=3)
+    study.task = Told(**{name: getattr(study.task, name) for name in study.task.__match_args__})
+    found = study._scores(None)
+    for name, (length, mass) in {"length": (1.0, 0.0), "masspole": (0.0, 1.0)}.items():
+        grid = found["grids"][name]["grid"]
+        assert grid == pytest.approx(torch.linspace(0.1, 2.0, 4).tolist())
+        others = 100 * 0.1 if length else 0.5
+        expected = [length * value + 100 * mass * value + others for value in grid]
+        assert found["grids"][name]["score"] == pytest.approx(expected)
+    assert found["at_real"] == pytest.approx(0.5 + 100 * 0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["task=fetch_reach", "points=4"], "a run with points=4, got 3"),
+        (["task=fetch_reach", "algorithm=td3"], "a run with algorithm=TD3+HER, got 'DDPG+HER'"),
+        (
+            ["task=fetch_push"],
+            "a run with algorithm=DDPG+HER, actor once in 2 updates, critic sees",
+        ),
+    ],
+)
+def test_policies_of_another_run_are_refused(arguments, said, finished, run, tmp_path, capsys):  # noqa: PLR0917
+    shutil.copytree(finished / "seed0", tmp_path / "seed0")
+    with pytest.raises(SystemExit, match="2"):
+        run(*TINY, "sources=prior,posterior", *arguments, f"out={tmp_path}")
+    assert said in capsys.readouterr().err
+
+
+def test_a_posterior_of_another_run_is_refused(finished, run, tmp_path, capsys):
+    shutil.copytree(finished / "seed0", tmp_path / "seed0")
+    (tmp_path / "seed0" / "posterior.json").unlink()
+    state = checkpoint.load(tmp_path / "seed0" / "posterior_state.pt")
+    state["made_by"]["simulations"] = 99
+    checkpoint.save(tmp_path / "seed0" / "posterior_state.pt", state)
+    with pytest.raises(SystemExit, match="2"):
+        run(*TINY, *SOURCES, f"out={tmp_path}")
+    assert "posterior_state.pt of a run with simulations=24, got 99" in capsys.readouterr().err
+
+
+def test_a_file_without_scores_is_refused(finished, run, tmp_path, capsys):
+    shutil.copytree(finished / "seed0", tmp_path / "seed0")
+    (tmp_path / "seed0" / "prior.json").write_text("{}")
+    with pytest.raises(SystemExit, match="2"):
+        run(*TINY, *SOURCES, f"out={tmp_path}")
+    assert "expected the scores of a policy" in capsys.readouterr().err
+
+
+def test_the_first_seeds_policies_are_filmed(cartpole):
+    result, folder = cartpole
+    for entry in result["runs"]:
+        assert_moves(folder / entry["video"])
+
+
+def assert_moves(film):
+    from PIL import Image
+
+    with Image.open(film) as pictures:
+        assert pictures.n_frames > 20
+        first = np.asarray(pictures.convert("L"))
+        pictures.seek(10)
+        moved = np.asarray(pictures.convert("L"))
+    assert first.std() > 5
+    assert (first != moved).any()
 
 
 def test_nominal_physics_that_are_true_are_trained_once(run, capsys):
