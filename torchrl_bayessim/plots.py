@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _BLUE, _ORANGE, _GREEN, _VERMILION, _PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
 _INK, _GREY, _LIGHT = "#222222", "#8A8A8A", "#D9D9D9"
+_LEGEND = {"framealpha": 1.0, "edgecolor": "none"}  # lines end at its text, not in it
 _CYCLE = (_BLUE, _VERMILION, _GREEN, _PURPLE, _ORANGE, _INK)
 
 
@@ -128,7 +129,8 @@ def learning_curves(
         raise ValueError(message("at least one curve", {}))
     figure = _figure(width=5.2, height=3.3)
     axes = _axes(figure)
-    for (name, (x, y)), colour in zip(curves.items(), _cycle(len(curves)), strict=True):
+    looks = zip(_cycle(len(curves)), _widths(len(curves)), strict=True)
+    for (name, (x, y)), (colour, width) in zip(curves.items(), looks, strict=True):
         steps, values = _array(x), np.atleast_2d(_array(y))
         if steps.ndim != 1 or values.ndim != 2 or values.shape[1] != len(steps):
             raise ValueError(
@@ -138,7 +140,7 @@ def learning_curves(
                 )
             )
         marker = "o" if len(steps) == 1 else None
-        axes.plot(steps, values.mean(0), color=colour, lw=1.8, marker=marker, label=name)
+        axes.plot(steps, values.mean(0), color=colour, lw=width, marker=marker, label=name)
         if len(values) > 1:
             low, high = values.min(0), values.max(0)
             axes.fill_between(steps, low, high, color=colour, alpha=0.18, lw=0)
@@ -153,7 +155,7 @@ def learning_curves(
         _thousands(axes)
     several = any(np.atleast_2d(_array(y)).shape[0] > 1 for _, y in curves.values())
     title = "mean, least and greatest of the seeds" if several else None
-    axes.legend(frameon=False, fontsize=9, title=title, title_fontsize=8)
+    axes.legend(fontsize=9, title=title, title_fontsize=8, **_LEGEND)
     return figure
 
 
@@ -220,7 +222,7 @@ def return_per_round(
     if high - low < least:
         middle = (low + high) / 2
         axes.set_ylim(middle - least / 2, middle + least / 2)
-    axes.legend(frameon=False, fontsize=9, loc="best")
+    axes.legend(fontsize=9, loc="best", **_LEGEND)
     return figure
 
 
@@ -343,6 +345,11 @@ def _handles(*, prior: bool, truth: bool) -> list[Any]:
     if truth:
         handles.append(Line2D([], [], color=_VERMILION, lw=1.2, label="truth"))
     return handles
+
+
+def _widths(count: int) -> list[float]:
+    """Return widths of lines, the first drawn the widest: it shows beside those that cover it."""
+    return [1.8 + 1.2 * (count - 1 - i) for i in range(count)]
 
 
 def _cycle(n: int) -> list[str]:

@@ -330,6 +330,24 @@ def test_a_reward_that_is_not_the_environments_is_refused(episodes):
     assert learner.finish() == {}
 
 
+def test_rewards_beyond_what_targets_are_bounded_by_are_refused(episodes):
+    ddpg = DDPG(push(), goal_reward, hidden=(16,), batch_size=64, rewards=(0.0, 1.0))
+    match = (
+        r"rewards within the given \(0\.0, 1\.0\).*got \(-1\.0, .*Try: DDPG\(\.\.\., rewards=\(-1"
+    )
+    with pytest.raises(ValueError, match=match):
+        ddpg.update(episodes, key=(0,))
+
+
+def test_so_few_transitions_that_no_update_is_due_are_refused(episodes):
+    ddpg = DDPG(push(), goal_reward, hidden=(16,), batch_size=64, updates_per_frame=0.001)
+    with pytest.raises(ValueError, match=r"one update per batch of 200 transitions.*got 0\.2"):
+        ddpg.update(episodes, key=(0,))
+    assert len(ddpg.buffer) == 0
+    none = DDPG(push(), goal_reward, hidden=(16,), batch_size=64, updates_per_frame=0.0)
+    assert none.update(episodes, key=(0,))["updates"] == 0  # as was asked
+
+
 def test_bad_batches_are_refused(episodes):
     learner = DDPG(push(), goal_reward, **SMALL)
     broken = episodes.clone()

@@ -194,7 +194,8 @@ class DDPG:
 
         Raises:
             ValueError: The batch lacks an entry, its rows are no whole episodes, its rewards are
-                not those of ``reward``, or the replay buffer holds less than one batch.
+                not those of ``reward`` or beyond ``rewards``, the replay buffer would hold less
+                than one batch, or no update is due for so few transitions.
             SimulationError: A value in the batch, a loss or a parameter is not finite. The networks
                 are then as they were before.
         """
@@ -210,19 +211,11 @@ class DDPG:
         """
         self.finish()
         self._check(batch)
+        updates = self._due(batch.numel())
         kept = batch.select(*self.kept_keys).detach()  # actions may come with the policy's graph
         before = copy.deepcopy(self._learned())
         self.buffer.extend(kept)
         self.state.observe(kept)
-        if len(self.buffer) < self.batch_size:
-            raise ValueError(
-                message(
-                    f"a replay buffer that holds at least one batch of {self.batch_size}",
-                    len(self.buffer),
-                    hint="more environments, or a smaller batch_size",
-                )
-            )
-        updates = round(self.updates_per_frame * batch.numel())
         self._report = {"loss_actor": 0.0, "loss_critic": 0.0, "updates": float(updates)}
         self._report["learning_rate"] = self._set_learning_rate(progress)
         self._owed = OwedUpdates(self._updates(updates, tuple(key)), updates), before
@@ -252,6 +245,20 @@ class DDPG:
             raise
         return self._report
 
+    def _due(self, frames: int) -> int:
+        """Return the updates for so many new transitions."""
+        held = min(len(self.buffer) + frames, self.buffer.capacity)
+        if held < self.batch_size:
+            expected = f"a replay buffer that holds at least one batch of {self.batch_size}"
+            hint = "more environments, or a smaller batch_size"
+            raise ValueError(message(expected, held, hint=hint))
+        updates = self.updates_per_frame * frames
+        if 0 < updates <= 0.5:
+            expected = f"at least one update per batch of {frames} transitions"
+            hint = "more transitions per batch, or larger updates_per_frame"
+            raise ValueError(message(expected, updates, hint=hint))
+        return round(updates)
+
     def _check(self, batch: TensorDictBase) -> None:
         for key in self.kept_keys:
             value = batch.get(key, None)
@@ -264,6 +271,12 @@ class DDPG:
                 raise SimulationError(
                     message(f"finite {key!r} in the batch", "NaN or infinity in some frames")
                 )
+        low, high = self.settings["rewards"]
+        given = batch["next", "reward"]
+        if given.min() < low or given.max() > high:
+            span = given.min().item(), given.max().item()
+            expected = f"rewards within the given {low, high}, by which targets are bounded"
+            raise ValueError(message(expected, span, hint=f"DDPG(..., rewards={span})"))
 
     def _check_learned(self) -> None:
         """Refuse what no loss has seen: the gradient of a part's last update may not be finite."""
