@@ -77,3 +77,9 @@ def test_a_rule_is_no_longer_than_it_need_be():
     limits = {name: limit for name, _, limit in cuts}
     assert limits["a"] == pytest.approx(0.5, abs=0.1)
     assert limits["b"] == pytest.approx(0.0, abs=0.1)
+
+
+def test_what_the_reader_must_know_is_told_once(prepared):
+    """The search for effects runs twice where less noise is left beside the first ones."""
+    first = prepared[0].alarmed("late", "short")
+    assert first.alarmed("late", "new").alarms == (*first.alarms, "new")

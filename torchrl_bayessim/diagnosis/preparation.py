@@ -68,8 +68,8 @@ class Prepared:
         return {name: tuple(log.name for log in part) for name, part in self.logs.items()}
 
     def alarmed(self, *alarms: str) -> Prepared:
-        """Return the same with more that the reader must know."""
-        return replace(self, alarms=(*self.alarms, *alarms))
+        """Return the same with more that the reader must know, each told once."""
+        return replace(self, alarms=tuple(dict.fromkeys((*self.alarms, *alarms))))
 
 
 def prepare(
