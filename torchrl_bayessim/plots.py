@@ -349,7 +349,7 @@ def _handles(*, prior: bool, truth: bool) -> list[Any]:
 
 def _widths(count: int) -> list[float]:
     """Return widths of lines, the first drawn the widest: it shows beside those that cover it."""
-    return [1.8 + 1.2 * (count - 1 - i) for i in range(count)]
+    return [1.6 + 0.7 * (count - 1 - i) for i in range(count)]
 
 
 def _cycle(n: int) -> list[str]:
