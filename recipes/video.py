@@ -21,6 +21,7 @@ from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
 from torchrl_bayessim.whole_file import replacing
 
+_HEADLESS = {"MUJOCO_GL": "egl", "SDL_VIDEODRIVER": "dummy"}
 LONGEST = 250  # steps of an episode
 
 
@@ -67,7 +68,8 @@ def record(
     """
     if not task.simulator_name:
         return None
-    os.environ.setdefault("MUJOCO_GL", "egl")
+    for name, value in {**_HEADLESS, "PYGAME_HIDE_SUPPORT_PROMPT": "1"}.items():
+        os.environ.setdefault(name, value)
     gymnasium.register_envs(gymnasium_robotics)
     try:
         _film(task, policy, theta, path, episodes=episodes, size=size)

@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import settings
@@ -18,6 +19,23 @@ def fixed_seed():
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         yield
+
+
+@pytest.fixture
+def moves():
+    """Return what asserts that a film has pictures, and that something moves in them."""
+    from PIL import Image
+
+    def check(film, *, pictures=20):
+        with Image.open(film) as shown:
+            assert shown.n_frames > pictures
+            first = np.asarray(shown.convert("L"))
+            shown.seek(shown.n_frames // 2)
+            later = np.asarray(shown.convert("L"))
+        assert first.std() > 5
+        assert (first != later).any()
+
+    return check
 
 
 @pytest.fixture

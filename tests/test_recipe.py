@@ -99,6 +99,11 @@ def test_pictures_curves_and_checkpoint_are_there(finished):
     assert all(path.read_text().strip() for path in scalars)
 
 
+def test_the_policy_is_filmed(finished, moves):
+    folder, _ = finished
+    moves(folder / "posterior.gif", pictures=5)
+
+
 def test_killed_in_mid_run_it_resumes_to_the_same_files(finished, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(RECIPE.parent / "benchmarks")
     from killed import Case, run
