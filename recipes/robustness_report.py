@@ -13,6 +13,8 @@ from intervals import interval
 
 from torchrl_bayessim import plots
 
+SOURCES = ("prior", "posterior", "oracle", "nominal")  # of one colour each in all pictures
+
 
 def curves(runs: list[dict[str, Any]], robot: dict[str, float]) -> list[dict[str, Any]]:
     """Return the entries ``curves`` of result.json: means and spread over the seeds.
@@ -117,7 +119,8 @@ def _common(result: dict[str, Any]) -> str:
     text = "Intervals are over seeds. All policies are scored in the same episodes"
     if result["score"] != "success":
         return f"{text}: other episodes would move them together."
-    shares = [run["at_real"] for run in result["runs"]] or [0.0]
+    columns = ("at_real", "under_prior")
+    shares = [run[column] for run in result["runs"] for column in columns] or [0.0]
     error = max((p * (1 - p) / result["real_episodes"]) ** 0.5 for p in shares)
     return f"{text}: others would move them together, by a standard error of {error:.3f} at most."
 
@@ -125,7 +128,8 @@ def _common(result: dict[str, Any]) -> str:
 def _besides(result: dict[str, Any]) -> str:
     """Return what the posterior costs beside training."""
     frames = result["inference_frames"]
-    return f"; the posterior took {frames:,} frames of simulation besides" if frames else ""
+    text = f"; the posterior took {frames:,} frames of simulation besides"
+    return f"{text}, and the prior's policy, which collects" if frames else ""
 
 
 def _chosen(result: dict[str, Any]) -> str:
@@ -159,7 +163,11 @@ def draw_pictures(out: Path, result: dict[str, Any]) -> list[Path]:
         own = [curve for curve in result["curves"] if curve["parameter"] == name]
         lines = {c["source"]: (torch.tensor(c["grid"]), torch.tensor(c["by_seed"])) for c in own}
         figure = plots.learning_curves(
-            lines, xlabel=name, ylabel=result["score"], marks={"the robot": truth}
+            lines,
+            xlabel=name,
+            ylabel=result["score"],
+            marks={"the robot": truth},
+            palette=SOURCES,
         )
         paths.append(out / f"robustness_{name}.png")
         recipe.save_picture(figure, paths[-1])
@@ -171,7 +179,8 @@ def draw_pictures(out: Path, result: dict[str, Any]) -> list[Path]:
         frames = [point["frames"] for point in own[0]]
         lines[source] = torch.tensor(frames), torch.tensor(values).nan_to_num(0.0)
     if lines and all(len(x) for x, _ in lines.values()):
-        figure = plots.learning_curves(lines, ylabel=f"{result['score']} under its own physics")
+        ylabel = f"{result['score']} under its own physics"
+        figure = plots.learning_curves(lines, ylabel=ylabel, palette=SOURCES)
         paths.append(out / "learning.png")
         recipe.save_picture(figure, paths[-1])
     return paths

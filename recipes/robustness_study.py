@@ -29,20 +29,10 @@ from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.summaries import SummaryStatistics
 from torchrl_bayessim.transforms import DomainRandomizer
 
-# Settings without which a policy's file would hold others, and those of its posterior
-MADE_BY = (
-    "task",
-    "setting",
-    "critic_sees_physics",
-    "batches",
-    "checkpoint",
-    "points",
-    "grid_episodes",
-    "real_episodes",
-    "short",
-)
+# Settings with others of which a file would hold another policy, posterior, or scores
+TRAINED_BY = ("task", "setting", "critic_sees_physics", "checkpoint", "matmul_precision", "short")
 INFERRED_BY = ("episodes", "simulations", "refinements")
-EPISODES = 4  # on film
+SCORED_BY = ("points", "grid_episodes", "real_episodes")
 # Looks at a policy in a training, of which the best is taken: dear where MuJoCo steps
 LOOKS = {"goals": 10, "returns": 20}
 CHOOSING = 256  # episodes: of 15 looks at 64 the best was a lucky one, 0.95 and then 0.86
@@ -67,7 +57,12 @@ class Study:
         self._begun = self.randomizer.get_extra_state()
         self.env = task.make(task.environments, seed=seed, randomizer=self.randomizer)
         check_influence(self.env, self.randomizer, task.prior, steps=task.horizon)
-        self.algorithm = getattr(self._learner(), "name", "PPO")
+        learner = self._learner()
+        self.algorithm = getattr(learner, "name", "PPO")
+        self.batches = settings.batches or getattr(task, "budget", 0)
+        frames = self.batches * task.environments * task.horizon
+        self._training = {"algorithm": self.algorithm, "frames": frames, "seed": seed}
+        self._training["learner"] = recipe.plain(getattr(learner, "settings", {}))
 
     @property
     def inference_frames(self) -> int:
@@ -79,7 +74,7 @@ class Study:
         """Return the scores of the policy trained under ``source``, from its file if it has one."""
         file = self.out / f"{source}.json"
         found = recipe.kept(file, lambda: self._made(source))
-        self._check_made_by(found.get("made_by"), source, file)
+        self._check_made_by(found.get("made_by"), file, *self._scoring(source))
         if "at_real" not in found:
             hint = "delete the file, and the policy is trained again"
             raise ValueError(
@@ -95,21 +90,23 @@ class Study:
         found = self._scored(source)
         seconds = time.monotonic() - start
         provenance = recipe.provenance(self.settings, seconds=seconds)
-        return found | {"made_by": self._made_by(source), "provenance": provenance}
+        made_by = self._made_by(*self._scoring(source))
+        return found | {"made_by": made_by, "provenance": provenance}
 
-    def _made_by(self, source: str) -> dict[str, Any]:
-        """Return what else would make other scores."""
-        names = MADE_BY + (INFERRED_BY if source == "posterior" else ())
-        named = {name: getattr(self.settings, name) for name in names}
-        return {"source": source, "seed": self.seed, "algorithm": self.algorithm, **named}
+    def _scoring(self, source: str) -> tuple[str, ...]:
+        return SCORED_BY + (INFERRED_BY if source == "posterior" else ())
 
-    def _check_made_by(self, found: Any, source: str, file: Path) -> None:
-        """Refuse what another run has made; older files, which do not say, are let pass."""
-        if found is None:
-            return
-        for name, asked in self._made_by(source).items():
-            if found.get(name) != asked:
-                expected, got = f"{file} of a run with {name}={asked}", found.get(name)
+    def _made_by(self, *names: str) -> dict[str, Any]:
+        """Return what else would make another file: how a policy is trained, and these settings."""
+        named = {name: getattr(self.settings, name) for name in (*TRAINED_BY, *names)}
+        return named | self._training
+
+    def _check_made_by(self, found: Any, file: Path, *names: str) -> None:
+        """Refuse what another run has made; what older files do not say is let pass."""
+        found = found or {}
+        for name, asked in self._made_by(*names).items():
+            if found.get(name, asked) != asked:
+                expected, got = f"{file} of a run with {name}={asked}", found[name]
                 hint = "another out=, or the settings of the run that wrote it"
                 raise ValueError(message(expected, got, hint=hint))
 
@@ -122,7 +119,7 @@ class Study:
         shown = thinned(trained.curve, 40)
         if self.settings.video and self.seed == self.settings.seed:
             film = self.out / f"{source}.gif"
-            made = record(self.task, learner.policy, self.truth, film, episodes=EPISODES)
+            made = record(self.task, learner.policy, self.truth, film)
             found["video"] = made and f"{self.out.name}/{film.name}"
         found["solved"] = first_solved(shown, SOLVED[self.settings.task])
         names = ("frames", "return", "score", "seconds", "cpu_seconds")
@@ -138,7 +135,7 @@ class Study:
         self.randomizer.source = self._source(source)
         self.randomizer.set_extra_state(self._begun)  # the same first episode for all sources
         goals = isinstance(self.task, GoalTask)
-        batches = self.settings.batches or getattr(self.task, "budget", 0)
+        batches = self.batches
         looks = LOOKS["goals" if goals else "returns"]
         chosen = self.settings.checkpoint == "best"
         plan = Plan(
@@ -172,7 +169,7 @@ class Study:
         file = self.out / "posterior_state.pt"
         if file.exists():
             state = checkpoint.load(file)
-            self._check_made_by(state.get("made_by"), "posterior", file)
+            self._check_made_by(state.get("made_by"), file, *INFERRED_BY)
             refinement.load_state_dict(state)
             return refinement.posterior
         task, settings = self.task, self.settings
@@ -202,7 +199,7 @@ class Study:
             )
             key = ("robustness", turn) if turn else ("robustness",)
             refinement.learn(pairs["theta"], pairs["summary"], observed, key=key)
-        made_by = {"made_by": self._made_by("posterior")}
+        made_by = {"made_by": self._made_by(*INFERRED_BY)}
         checkpoint.save(file, refinement.state_dict() | made_by)
         return refinement.posterior
 

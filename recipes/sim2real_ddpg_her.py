@@ -98,7 +98,7 @@ def job(settings: Sim2RealFetch, out: Path) -> dict[str, Any]:
     curves = {"posterior": [point for entry in rounds for point in entry["curve"]]}
     if settings.video:
         film = out / "posterior.gif"
-        episodes = 1 if settings.short else 4
+        episodes = 1 if settings.short else 0
         result["video"] = record(task, run.learner.policy, truth, film, episodes=episodes)
     if settings.baseline:
         curves["prior"] = run.go_on_under_prior().curve

@@ -103,7 +103,7 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
         }
         if settings.video:
             film = out / "posterior.gif"
-            result["video"] = record(task, learner.policy, truth, film, episodes=1)
+            result["video"] = record(task, learner.policy, truth, film)
         curves = {"posterior": [point for entry in done.rounds for point in entry["curve"]]}
         if settings.baseline:
             returns = score(learner.policy)

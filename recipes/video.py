@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from pathlib import Path
@@ -12,8 +13,8 @@ import gymnasium_robotics
 import torch
 from tasks import Task
 from torch import Tensor
-from torchrl.envs import Compose, DoubleToFloat, GymEnv, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymEnv, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from torchrl.record import VideoRecorder
 from torchrl.record.loggers import Logger
 
@@ -21,21 +22,17 @@ from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
 from torchrl_bayessim.whole_file import replacing
 
+_EPISODES = 4  # of goals, which are short; one of others
 _HEADLESS = {"MUJOCO_GL": "egl", "SDL_VIDEODRIVER": "dummy"}
 LONGEST = 250  # steps of an episode
 
 
 class GifLogger(Logger):
-    """Keeps what `VideoRecorder` hands on as a GIF; TorchRL's own loggers need more packages.
+    """Keeps what `VideoRecorder` hands on as a GIF; TorchRL's own loggers need more packages."""
 
-    Args:
-        path: The file.
-        size: Pixels of the longer side at most.
-    """
-
-    def __init__(self, path: Path, *, size: int) -> None:
+    def __init__(self, path: Path) -> None:
         super().__init__(exp_name=path.stem, log_dir=str(path.parent))
-        self.path, self.size = path, size
+        self.path = path
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **_: Any) -> None:
         """Write a video of shape ``(1, T, 3, H, W)``, uint8, 25 pictures a second."""
@@ -43,8 +40,6 @@ class GifLogger(Logger):
 
         del name, step
         frames = [Image.fromarray(f.permute(1, 2, 0).numpy()) for f in video[0]]
-        for frame in frames:
-            frame.thumbnail((self.size, self.size))
         first, *others = [f.quantize(64) for f in frames]
         looped = {"save_all": True, "append_images": others, "duration": 40, "loop": 0}
         with replacing(self.path) as file:
@@ -59,13 +54,35 @@ class GifLogger(Logger):
         return f"GifLogger({self.path})"
 
 
-def record(
-    task: Task, policy: Any, theta: Tensor, path: Path, *, episodes: int, size: int = 240
-) -> str | None:
-    """Film episodes at given physics; return the file, or None where nothing can be rendered.
+class SmallRecorder(VideoRecorder):
+    """Keeps pictures small: those of classic control are 400 by 600, and all stay in memory."""
 
-    Of long episodes the first 250 steps are filmed.
+    def __init__(self, logger: Logger, *, tag: str, size: int) -> None:
+        super().__init__(logger, tag=tag, skip=1)
+        self.size = size
+
+    def _apply_transform(self, observation: Tensor) -> Tensor:
+        every = math.ceil(max(observation.shape[:2]) / self.size)
+        picture = observation.permute(2, 0, 1).float()
+        small = torch.nn.functional.avg_pool2d(picture, every).round().to(torch.uint8)
+        super()._apply_transform(small.permute(1, 2, 0))
+        return observation
+
+
+def record(
+    task: Task, policy: Any, theta: Tensor, path: Path, *, episodes: int = 0, size: int = 240
+) -> str | None:
+    """Film a policy at given physics; return the file, or None where nothing can be rendered.
+
+    Args:
+        task: Its simulator's name tells what renders it.
+        policy: What acts.
+        theta: The physics.
+        path: The file.
+        episodes: How many; 0 for four of goals, or the first 250 steps of one.
+        size: Pixels of the longer side at most.
     """
+    episodes = episodes or (_EPISODES if task.max_steps <= LONGEST / _EPISODES else 1)
     if not task.simulator_name:
         return None
     for name, value in {**_HEADLESS, "PYGAME_HIDE_SUPPORT_PROMPT": "1"}.items():
@@ -86,14 +103,23 @@ def _film(task: Task, policy: Any, theta: Tensor, path: Path, *, episodes: int, 
         if "Fetch" in name:  # whose own size takes long to draw
             options |= {"width": size, "height": size}
         filmed = GymEnv(name, **options)
-    recorder = VideoRecorder(GifLogger(path, size=size), tag=path.stem, skip=1)
+    recorder = SmallRecorder(GifLogger(path), tag=path.stem, size=size)
     physics = ApplyPhysics(task.physics()), DomainRandomizer(Grid(theta[None]))
     env = TransformedEnv(filmed, Compose(*physics, DoubleToFloat(), recorder))
     try:
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             env.set_seed(0)
             for _ in range(episodes):
-                env.rollout(min(task.max_steps, LONGEST), policy)
+                _watch(env, policy, steps=min(task.max_steps, LONGEST))
         recorder.dump()
     finally:
         env.close()
+
+
+def _watch(env: EnvBase, policy: Any, *, steps: int) -> None:
+    """Let the policy act; a rollout would keep every picture twice."""
+    state = env.reset()
+    for _ in range(steps):
+        state = step_mdp(env.step(policy(state)))
+        if state["done"].all():
+            break

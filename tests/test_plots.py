@@ -77,6 +77,17 @@ def test_a_point_mass_can_be_drawn(tmp_path):
     figure.savefig(tmp_path / "point.png")
 
 
+def test_a_name_of_the_palette_has_its_colour_whichever_curves_are_drawn():
+    def colours(*names):
+        curves = {name: (torch.arange(3), torch.rand(3)) for name in names}
+        axes = learning_curves(curves, palette=["prior", "posterior", "oracle"]).axes[0]
+        return {line.get_label(): line.get_color() for line in axes.lines}
+
+    every = colours("prior", "posterior", "oracle")
+    assert len(set(every.values())) == 3
+    assert colours("oracle", "prior") == {name: every[name] for name in ("oracle", "prior")}
+
+
 def test_learning_curves_have_a_band_for_several_seeds_only():
     x = torch.arange(4)
     figure = learning_curves({"many": (x, torch.rand(3, 4)), "one": (x, torch.rand(4))})
@@ -120,6 +131,10 @@ def test_return_per_round_draws_intervals_and_the_baseline():
             "truth with 1 columns",
         ),
         (lambda: learning_curves({}), "at least one curve"),
+        (
+            lambda: learning_curves({"a": (torch.rand(3), torch.rand(3))}, palette=["b", "c"]),
+            r"curves that palette names, got \['a'\]. Available: b, c",
+        ),
         (
             lambda: learning_curves({"a": (torch.rand(3), torch.rand(4))}),
             r"x \(P,\) and y .* in curve 'a'",

@@ -106,6 +106,7 @@ def learning_curves(
     ylabel: str = "return",
     baseline: Mapping[str, float] | None = None,
     marks: Mapping[str, float] | None = None,
+    palette: Sequence[str] = (),
 ) -> Figure:
     """Draw a line per entry of ``curves``, with a band where there are several seeds, and say so.
 
@@ -116,9 +117,11 @@ def learning_curves(
         ylabel: What the vertical axis shows.
         baseline: Names and heights of horizontal lines.
         marks: Names and places of vertical lines.
+        palette: Names that have the colours of their places in it, whichever are drawn; default
+            those of ``curves``.
 
     Raises:
-        ValueError: No curve, or shapes that do not agree.
+        ValueError: No curve, a curve that ``palette`` does not name, or shapes that do not agree.
 
     Example:
         >>> figure = learning_curves({"prior": (torch.arange(3), torch.rand(5, 3))})
@@ -129,8 +132,12 @@ def learning_curves(
         raise ValueError(message("at least one curve", {}))
     figure = _figure(width=5.2, height=3.3)
     axes = _axes(figure)
-    looks = zip(_cycle(len(curves)), _widths(len(curves)), strict=True)
-    for (name, (x, y)), (colour, width) in zip(curves.items(), looks, strict=True):
+    named = list(palette or curves)
+    if not curves.keys() <= set(named):
+        raise ValueError(message("curves that palette names", list(curves), available=named))
+    colours = dict(zip(named, _cycle(len(named)), strict=True))
+    for (name, (x, y)), width in zip(curves.items(), _widths(len(curves)), strict=True):
+        colour = colours[name]
         steps, values = _array(x), np.atleast_2d(_array(y))
         if steps.ndim != 1 or values.ndim != 2 or values.shape[1] != len(steps):
             raise ValueError(

@@ -332,9 +332,7 @@ def test_a_reward_that_is_not_the_environments_is_refused(episodes):
 
 def test_rewards_beyond_what_targets_are_bounded_by_are_refused(episodes):
     ddpg = DDPG(push(), goal_reward, hidden=(16,), batch_size=64, rewards=(0.0, 1.0))
-    match = (
-        r"rewards within the given \(0\.0, 1\.0\).*got \(-1\.0, .*Try: DDPG\(\.\.\., rewards=\(-1"
-    )
+    match = r"rewards within the given \(0\.0, 1\.0\).*got \(-1\.0, .*least, greatest\) of all"
     with pytest.raises(ValueError, match=match):
         ddpg.update(episodes, key=(0,))
 
@@ -370,6 +368,7 @@ def test_bad_batches_are_refused(episodes):
         ({"critic_keys": ["thetaa"]}, ValueError, r"theta \(did you mean this\?\)"),
         ({"gamma": 1.0}, ValueError, r"gamma of at least 0 and below 1, got 1\.0"),
         ({"rewards": (0.0, -1.0)}, ValueError, r"greatest.*Try: rewards=\(-1\.0, 0\.0\)"),
+        ({"rewards": (-1.0, -1.0)}, ValueError, r"one is greater, got \(-1\.0, -1\.0\)"),
         ({"rewards": (float("nan"), 0.0)}, ValueError, "a finite least reward, got nan"),
         ({"rewards": (-1.0, float("nan"))}, ValueError, "a finite greatest reward, got nan"),
         ({"rewards": (-1.0,)}, ValueError, r"two numbers, got \(-1\.0,\)"),

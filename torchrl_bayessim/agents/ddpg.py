@@ -276,7 +276,8 @@ class DDPG:
         if given.min() < low or given.max() > high:
             span = given.min().item(), given.max().item()
             expected = f"rewards within the given {low, high}, by which targets are bounded"
-            raise ValueError(message(expected, span, hint=f"DDPG(..., rewards={span})"))
+            hint = "rewards=(least, greatest) of all that the reward function can give"
+            raise ValueError(message(expected, span, hint=hint))
 
     def _check_learned(self) -> None:
         """Refuse what no loss has seen: the gradient of a part's last update may not be finite."""
@@ -399,3 +400,5 @@ def _check_rewards(rewards: Any) -> None:
     low, high = rewards
     if low > high:
         raise ValueError(message(expected, rewards, hint=f"rewards={high, low}"))
+    if low == high:
+        raise ValueError(message(f"{expected} of which one is greater", rewards))
