@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import gymnasium_robotics
 import torch
 from tasks import Task
 from torch import Tensor
@@ -22,6 +21,7 @@ from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
 from torchrl_bayessim.whole_file import replacing
 
+FETCH = "Fetch"
 _EPISODES = 4  # of goals, which are short; one of others
 _HEADLESS = {"MUJOCO_GL": "egl", "SDL_VIDEODRIVER": "dummy"}
 LONGEST = 250  # steps of an episode
@@ -87,7 +87,10 @@ def record(
         return None
     for name, value in {**_HEADLESS, "PYGAME_HIDE_SUPPORT_PROMPT": "1"}.items():
         os.environ.setdefault(name, value)
-    gymnasium.register_envs(gymnasium_robotics)
+    if FETCH in task.simulator_name:
+        import gymnasium_robotics  # which talks when it is imported
+
+        gymnasium.register_envs(gymnasium_robotics)
     try:
         _film(task, policy, theta, path, episodes=episodes, size=size)
     except Exception as error:  # a driver's, at any step of it; the job goes on without
@@ -100,7 +103,7 @@ def _film(task: Task, policy: Any, theta: Tensor, path: Path, *, episodes: int, 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         name, options = task.simulator_name, {"from_pixels": True, "pixels_only": False}
-        if "Fetch" in name:  # whose own size takes long to draw
+        if FETCH in name:  # whose own size takes long to draw
             options |= {"width": size, "height": size}
         filmed = GymEnv(name, **options)
     recorder = SmallRecorder(GifLogger(path), tag=path.stem, size=size)
