@@ -35,6 +35,7 @@ from tqdm.auto import tqdm
 
 from torchrl_bayessim.counts import check_count
 from torchrl_bayessim.errors import message
+from torchrl_bayessim.kinds import check_choice
 from torchrl_bayessim.whole_file import write_text
 
 SOURCES = ("nominal", "prior", "posterior", "oracle")
@@ -139,17 +140,14 @@ def job(settings: Robustness, out: Path) -> dict[str, Any]:
 def chosen(settings: Robustness) -> Task:
     """Return the task as the settings have it."""
     known = {"cartpole": TASKS["cartpole"], **FETCH}
-    if settings.task not in known:
-        raise ValueError(message("a task", settings.task, available=known))
+    check_choice("a task", settings.task, known)
     task = known[settings.task]
     for name, least in COUNTS.items():
         check_count(f"{name}=", getattr(settings, name), least=least)
     available = PRESETS if isinstance(task, GoalTask) else tuple(PPO_SETTINGS)
     settings.setting = settings.setting or available[0]
-    if settings.setting not in available:
-        raise ValueError(message("a setting", settings.setting, available=available))
-    if settings.checkpoint not in {"best", "last"}:
-        raise ValueError(message("a checkpoint", settings.checkpoint, available=["best", "last"]))
+    check_choice("a setting", settings.setting, available)
+    check_choice("a checkpoint", settings.checkpoint, ["best", "last"])
     # one friction is found at once; a mass at the edge of its prior, once simulations are near it
     settings.refinements = settings.refinements or (1 if isinstance(task, GoalTask) else 2)
     if isinstance(task, GoalTask):
@@ -180,8 +178,7 @@ def chosen_sources(settings: Robustness, truth: Tensor, usual: Tensor) -> list[s
     """Return the sources in order, prior before posterior; nominal only where it is not true."""
     asked = settings.sources.split(",")
     for name in asked:
-        if name not in SOURCES:
-            raise ValueError(message("a source of physics", name, available=SOURCES))
+        check_choice("a source of physics", name, SOURCES)
     if "posterior" in asked and "prior" not in asked:
         raise ValueError(
             message("the prior among the sources: its policy collects", settings.sources)

@@ -13,7 +13,7 @@ from intervals import interval
 
 from torchrl_bayessim import plots
 
-SOURCES = ("prior", "posterior", "oracle", "nominal")  # of one colour each in all pictures
+PALETTE = ("prior", "posterior", "oracle", "nominal")  # of one colour each in all pictures
 
 
 def curves(runs: list[dict[str, Any]], robot: dict[str, float]) -> list[dict[str, Any]]:
@@ -167,7 +167,7 @@ def draw_pictures(out: Path, result: dict[str, Any]) -> list[Path]:
             xlabel=name,
             ylabel=result["score"],
             marks={"the robot": truth},
-            palette=SOURCES,
+            palette=PALETTE,
         )
         paths.append(out / f"robustness_{name}.png")
         recipe.save_picture(figure, paths[-1])
@@ -180,7 +180,7 @@ def draw_pictures(out: Path, result: dict[str, Any]) -> list[Path]:
         lines[source] = torch.tensor(frames), torch.tensor(values).nan_to_num(0.0)
     if lines and all(len(x) for x, _ in lines.values()):
         ylabel = f"{result['score']} under its own physics"
-        figure = plots.learning_curves(lines, ylabel=ylabel, palette=SOURCES)
+        figure = plots.learning_curves(lines, ylabel=ylabel, palette=PALETTE)
         paths.append(out / "learning.png")
         recipe.save_picture(figure, paths[-1])
     return paths

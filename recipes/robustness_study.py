@@ -135,15 +135,14 @@ class Study:
         self.randomizer.source = self._source(source)
         self.randomizer.set_extra_state(self._begun)  # the same first episode for all sources
         goals = isinstance(self.task, GoalTask)
-        batches = self.batches
         looks = LOOKS["goals" if goals else "returns"]
         chosen = self.settings.checkpoint == "best"
         plan = Plan(
-            2 if self.settings.short else batches,
+            2 if self.settings.short else self.batches,
             self.task.horizon,
             file=self.out / f"{source}.pt",
             keep_every=50 if goals else 200,
-            score_every=math.ceil(batches / looks) or 1,
+            score_every=math.ceil(self.batches / looks) or 1,
         )
         return train(
             learner,
@@ -151,7 +150,7 @@ class Study:
             self.randomizer,
             plan,
             key=(self.seed, "robustness"),  # the same for all sources: common random numbers
-            score=self._select(source) if chosen else None,
+            score=self._select() if chosen else None,
             label=f"seed {self.seed}, {source}",
             progress=self.settings.progress,
         )
@@ -219,9 +218,9 @@ class Study:
             "nats_over_prior": gain.item(),
         }
 
-    def _select(self, source: str) -> Any:
+    def _select(self) -> Any:
         """Return the score by which a checkpoint is chosen: other episodes, own physics."""
-        score = Score(self.task, self._source(source), episodes=CHOOSING, seed=7)
+        score = Score(self.task, self.randomizer.source, episodes=CHOOSING, seed=7)
         return lambda policy: score(policy).mean().item()
 
     def _scores(self, policy: Any) -> dict[str, Any]:

@@ -340,7 +340,6 @@ def test_the_first_seeds_policies_are_filmed(cartpole, moves):
 
 def test_nominal_physics_that_are_true_are_trained_once(run, capsys):
     import robustness
-    import torch
 
     settings = robustness.Robustness()
     same, other = torch.tensor([0.5, 0.1]), torch.tensor([0.6, 0.1])
