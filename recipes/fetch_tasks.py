@@ -12,10 +12,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import gymnasium
 import torch
 from tasks import Task
 from torch import Tensor
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, GymEnv
 
 from torchrl_bayessim.agents.ddpg import DDPG
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
@@ -51,6 +52,14 @@ class GoalTask(Task):
     def learner(self, env: EnvBase, **options: Any) -> DDPG:
         """Return an untrained learner."""
         return DDPG(env, goal_reward, **{**self.ddpg, **options})
+
+    def rendered(self, size: int) -> EnvBase:
+        """Return gymnasium-robotics' simulator with square pictures: its own take long to draw."""
+        import gymnasium_robotics  # which talks when it is imported
+
+        gymnasium.register_envs(gymnasium_robotics)
+        pictures = {"from_pixels": True, "pixels_only": False, "width": size, "height": size}
+        return GymEnv(self.simulator_name, **pictures)
 
     def scores(self, env: EnvBase, policy: Any) -> Tensor:
         """Return 1 for each environment whose goal is reached, 0 for the others."""

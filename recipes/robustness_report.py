@@ -177,7 +177,7 @@ def draw_pictures(out: Path, result: dict[str, Any]) -> list[Path]:
         key = "score" if all("score" in point for point in own[0]) else "return"
         values = [[p[key] if p[key] is not None else math.nan for p in curve] for curve in own]
         frames = [point["frames"] for point in own[0]]
-        lines[source] = torch.tensor(frames), torch.tensor(values).nan_to_num(0.0)
+        lines[source] = torch.tensor(frames), torch.tensor(values)
     if lines and all(len(x) for x, _ in lines.values()):
         ylabel = f"{result['score']} under its own physics"
         figure = plots.learning_curves(lines, ylabel=ylabel, palette=PALETTE)

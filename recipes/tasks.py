@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, TransformedEnv
+from torchrl.envs import Compose, EnvBase, GymEnv, RewardSum, StepCounter, TransformedEnv
 
 from torchrl_bayessim.envs.classic_control.acrobot import AcrobotEnv
 from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
@@ -71,6 +71,11 @@ class Task:
             self.simulator(environments, seed),
             Compose(*transforms, StepCounter(self.max_steps), RewardSum()),
         )
+
+    def rendered(self, size: int) -> EnvBase:
+        """Return Gymnasium's own simulator with pictures, of about ``size`` pixels if it can."""
+        del size
+        return GymEnv(self.simulator_name, from_pixels=True, pixels_only=False)
 
     def scores(self, env: EnvBase, policy: Any) -> Tensor:
         """Return what a policy is worth in one episode of each environment: its return."""

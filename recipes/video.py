@@ -8,11 +8,10 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import torch
 from tasks import Task
 from torch import Tensor
-from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymEnv, TransformedEnv
+from torchrl.envs import Compose, DoubleToFloat, EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from torchrl.record import VideoRecorder
 from torchrl.record.loggers import Logger
@@ -21,7 +20,6 @@ from torchrl_bayessim.sources import Grid
 from torchrl_bayessim.transforms import ApplyPhysics, DomainRandomizer
 from torchrl_bayessim.whole_file import replacing
 
-FETCH = "Fetch"
 _EPISODES = 4  # of goals, which are short; one of others
 _HEADLESS = {"MUJOCO_GL": "egl", "SDL_VIDEODRIVER": "dummy"}
 LONGEST = 250  # steps of an episode
@@ -75,7 +73,7 @@ def record(
     """Film a policy at given physics; return the file, or None where nothing can be rendered.
 
     Args:
-        task: Its simulator's name tells what renders it.
+        task: Which `Task.rendered` shows, if its simulator has a name.
         policy: What acts.
         theta: The physics.
         path: The file.
@@ -87,10 +85,6 @@ def record(
         return None
     for name, value in {**_HEADLESS, "PYGAME_HIDE_SUPPORT_PROMPT": "1"}.items():
         os.environ.setdefault(name, value)
-    if FETCH in task.simulator_name:
-        import gymnasium_robotics  # which talks when it is imported
-
-        gymnasium.register_envs(gymnasium_robotics)
     try:
         _film(task, policy, theta, path, episodes=episodes, size=size)
     except Exception as error:  # a driver's, at any step of it; the job goes on without
@@ -102,10 +96,7 @@ def record(
 def _film(task: Task, policy: Any, theta: Tensor, path: Path, *, episodes: int, size: int) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        name, options = task.simulator_name, {"from_pixels": True, "pixels_only": False}
-        if FETCH in name:  # whose own size takes long to draw
-            options |= {"width": size, "height": size}
-        filmed = GymEnv(name, **options)
+        filmed = task.rendered(size)
     recorder = SmallRecorder(GifLogger(path), tag=path.stem, size=size)
     physics = ApplyPhysics(task.physics()), DomainRandomizer(Grid(theta[None]))
     env = TransformedEnv(filmed, Compose(*physics, DoubleToFloat(), recorder))
