@@ -19,7 +19,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import kept_json
 import torch
@@ -37,12 +37,13 @@ PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "torchrl_ba
 SEEDS = 2**32
 THREADS = 1024
 MATMUL_PRECISIONS = ("highest", "high", "medium")
-FREE = ("progress", "debug", "logger")  # settings that a resumed run may change
 
 
 @dataclasses.dataclass
 class Settings:
-    """Fields of every recipe."""
+    """Fields of every recipe; those that are ``free`` may be others when a run is resumed."""
+
+    free: ClassVar[tuple[str, ...]] = ("progress", "debug", "logger")
 
     seed: int = 0
     out: str = ""  # folder; outputs/NAME/TIME by default
@@ -222,7 +223,7 @@ def resumed(settings: S, given: list[str]) -> S:
     earlier = _earlier(path, type(settings)) | {"resume": folder, "out": folder}
     for key in given:
         value = getattr(settings, key)
-        if key in FREE:
+        if key in settings.free:
             earlier[key] = value
         elif value != earlier[key]:
             raise ValueError(message(f"{key}={earlier[key]}, as in the run to resume", value))

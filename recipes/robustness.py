@@ -11,10 +11,14 @@ the same episodes: over a grid of each parameter with the others at the truth, a
 under physics drawn from the prior. Posterior and prior are compared in pairs: one difference per
 seed, with its Student interval. Episodes by which a checkpoint is chosen are others.
 
-CartPole's PPO has two settings, ``paper``, that of rl-zoo, which the paper used, and ``strong``, of
-a longer view; DDPG's on Fetch are ``fast``, ``wide``, larger networks and more updates for Push, as
-older results have it, and ``paper``, the original budget. Writes result.json, table.md and a
-picture per parameter, and films the first seed's policies; ``resume=FOLDER`` goes on.
+CartPole's PPO has two presets: ``paper``, with the settings of rl-zoo, which the paper cites, and
+100 domains drawn once, as the paper has them, but rl-zoo's 100,000 frames and not the paper's two
+million; and ``strong``, of a longer view, with a new domain in every episode. DDPG's on Fetch are
+``fast``, ``wide``, larger networks and more updates for Push, as older results have it, and
+``paper``, the original budget. Writes result.json, table.md and a picture per parameter, and films
+the first seed's policies; ``resume=FOLDER`` goes on, also with other ``seed=``, ``seeds=`` or
+``sources=``: seeds that ran side by side, each with ``seeds=1`` in the one folder, become one
+figure so.
 """
 
 from __future__ import annotations
@@ -22,7 +26,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import recipe
 import torch
@@ -41,23 +45,26 @@ from torchrl_bayessim.whole_file import write_text
 SOURCES = ("nominal", "prior", "posterior", "oracle")
 # "paper": PPO as rl-zoo sets CartPole, which the paper cites, but for a constant clip range;
 # "strong": a longer view and larger batches, under which the prior policy solved the box in trials.
-PPO_SETTINGS: dict[str, dict[str, Any]] = {
+PPO_PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "environments": 8,
         "horizon": 32,
         "budget": 400,
+        "domains": 100,
         "ppo": {"gamma": 0.98, "gae_lambda": 0.8, "minibatch_size": 256, "epochs": 20},
     },
     "strong": {
         "environments": 32,
         "horizon": 128,
         "budget": 100,
+        "domains": 0,
         "ppo": {"gamma": 0.99, "gae_lambda": 0.95, "minibatch_size": 512, "epochs": 10},
     },
 }
 
 COUNTS = {
     "seeds": 0,
+    "domains": -1,
     "batches": 0,  # 0 for the task's own
     "episodes": 1,
     "simulations": 8,
@@ -72,11 +79,15 @@ COUNTS = {
 class Robustness(recipe.Settings):
     """Settings; ``key=value`` on the command line overrides them."""
 
+    free: ClassVar = (*recipe.Settings.free, "seed", "seeds", "sources")
+
     task: str = "cartpole"
     sources: str = "nominal,prior,posterior,oracle"
     seeds: int = 0  # policies per source; 0 for 5 (CartPole) or 3 (Fetch)
     batches: int = 0  # of training per policy; 0 for the task's own number
-    setting: str = ""  # paper or strong (CartPole), fast, wide or paper (Fetch); or the first
+    preset: str = ""  # paper or strong (CartPole), fast, wide or paper (Fetch); or the first
+    truth: str = ""  # the robot's parameters, such as 0.3 or 0.5,0.1; empty for the task's own
+    domains: int = -1  # drawn once, and trained under; 0 for new ones always, -1 for the preset's
     algorithm: str = ""  # ddpg or td3; empty for the task's own
     critic_sees_physics: bool | None = None  # of Fetch; None for the task's own
     episodes: int = 8  # real episodes that the posterior is inferred from
@@ -114,7 +125,8 @@ def job(settings: Robustness, out: Path) -> dict[str, Any]:
     result = {
         "task": settings.task,
         "algorithm": study.algorithm,
-        "setting": settings.setting,
+        "preset": settings.preset,
+        "domains": settings.domains,
         "parameters": list(task.prior.names),
         "true": truth.tolist(),
         "score": "success" if isinstance(task, GoalTask) else "return",
@@ -144,14 +156,17 @@ def chosen(settings: Robustness) -> Task:
     task = known[settings.task]
     for name, least in COUNTS.items():
         check_count(f"{name}=", getattr(settings, name), least=least)
-    available = PRESETS if isinstance(task, GoalTask) else tuple(PPO_SETTINGS)
-    settings.setting = settings.setting or available[0]
-    check_choice("a setting", settings.setting, available)
+    available = PRESETS if isinstance(task, GoalTask) else tuple(PPO_PRESETS)
+    settings.preset = settings.preset or available[0]
+    check_choice("a preset", settings.preset, available)
     check_choice("a checkpoint", settings.checkpoint, ["best", "last"])
     # one friction is found at once; a mass at the edge of its prior, once simulations are near it
     settings.refinements = settings.refinements or (1 if isinstance(task, GoalTask) else 2)
+    if settings.truth:
+        task = replace(task, truth=as_truth(settings.truth, task))
     if isinstance(task, GoalTask):
-        task = as_preset(task, settings.setting)
+        settings.domains = max(settings.domains, 0)
+        task = as_preset(task, settings.preset)
         if settings.short:
             task = replace(task, environments=4)
         return with_learner(
@@ -163,10 +178,28 @@ def chosen(settings: Robustness) -> Task:
     if settings.algorithm or settings.critic_sees_physics is not None:
         got = settings.algorithm or f"critic_sees_physics={settings.critic_sees_physics}"
         raise ValueError(message("an algorithm or a critic's view for Fetch tasks only", got))
-    given = PPO_SETTINGS[settings.setting]
+    given = PPO_PRESETS[settings.preset]
+    settings.domains = given["domains"] if settings.domains < 0 else settings.domains
     settings.batches = settings.batches or given["budget"]
     ppo = {**given["ppo"], "final_learning_rate": 0.0} | ({"epochs": 2} if settings.short else {})
     return replace(task, environments=given["environments"], horizon=given["horizon"], ppo=ppo)
+
+
+def as_truth(text: str, task: Task) -> dict[str, float]:
+    """Return the robot's parameters by name.
+
+    Raises:
+        ValueError: They are not as many numbers as the prior has, or outside of it.
+    """
+    names, low, high = task.prior.names, task.prior.low.tolist(), task.prior.high.tolist()
+    try:
+        values = [float(value) for value in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != len(names) or not task.prior.log_prob(torch.tensor(values)).isfinite():
+        box = ", ".join(f"{n} in [{a:g}, {b:g}]" for n, a, b in zip(names, low, high, strict=True))
+        raise ValueError(message(f"truth= as numbers within the prior, {box}", text))
+    return dict(zip(names, values, strict=True))
 
 
 def default_seeds(task: Task) -> int:

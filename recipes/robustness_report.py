@@ -86,7 +86,7 @@ def table(result: dict[str, Any]) -> str:
         f"{result['task']}, {result['algorithm']}, {seeds} seeds, {result['frames']:,} frames per "
         f"policy, {score} in the same {result['real_episodes']} episodes at the robot "
         f"({', '.join(f'{n} {v:.3g}' for n, v in _truth(result))}){_besides(result)}"
-        f"{_chosen(result)}",
+        f"{_chosen(result)}{_domains(result)}",
         "",
         f"| trained under | {score} at the robot, mean and 95 % interval over seeds | spread (sd) "
         f"| each seed | {score} under the prior | its own physics first solved after (frames) |",
@@ -101,7 +101,7 @@ def table(result: dict[str, Any]) -> str:
         other = f"{_with_interval(elsewhere, share=share)}: {_each(elsewhere)}"
         cells = source, _with_interval(entry, share=share), spread, _each(entry), other, when
         lines.append(f"| {' | '.join(cells)} |")
-    lines += ["", _common(result)]
+    lines += ["", f"{_common(result)}{_commits(result)}"]
     told = [run["posterior"] for run in result["posteriors"]]
     if told:
         lines += ["", "| seed | posterior, mean ± sd | nats over the prior |", "|---|---|---|"]
@@ -127,7 +127,7 @@ def _common(result: dict[str, Any]) -> str:
 
 def _besides(result: dict[str, Any]) -> str:
     """Return what the posterior costs beside training."""
-    frames = result["inference_frames"]
+    frames = result.get("inference_frames", 0)  # which older results do not say
     text = f"; the posterior took {frames:,} frames of simulation besides"
     return f"{text}, and the prior's policy, which collects" if frames else ""
 
@@ -137,6 +137,24 @@ def _chosen(result: dict[str, Any]) -> str:
     told = {"best": "each the best of its looks under its own physics", "last": "each the last"}
     kind = result.get("checkpoint")
     return f"; policies are {told[kind]}" if kind else ""
+
+
+def _domains(result: dict[str, Any]) -> str:
+    """Return how many domains were trained under, if they were drawn once."""
+    count = result.get("domains", 0)
+    return f"; under prior and posterior each policy saw {count} domains" if count else ""
+
+
+def _commits(result: dict[str, Any]) -> str:
+    """Return which code trained which policies, where it was not one code for all."""
+    made: dict[str, list[str]] = {}
+    for run in result["runs"]:
+        commit = run.get("provenance", {}).get("commit") or "older code"
+        made.setdefault(commit, []).append(run["source"])
+    if len(made) < 2:
+        return ""
+    told = (f"{commit} ({', '.join(dict.fromkeys(who))})" for commit, who in made.items())
+    return f" Policies were trained at commits {', '.join(told)}."
 
 
 def _with_interval(entry: dict[str, Any], *, share: bool) -> str:

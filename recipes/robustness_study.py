@@ -30,9 +30,12 @@ from torchrl_bayessim.summaries import SummaryStatistics
 from torchrl_bayessim.transforms import DomainRandomizer
 
 # Settings with others of which a file would hold another policy, posterior, or scores
-TRAINED_BY = ("task", "setting", "critic_sees_physics", "checkpoint", "matmul_precision", "short")
-INFERRED_BY = ("episodes", "simulations", "refinements")
-SCORED_BY = ("points", "grid_episodes", "real_episodes")
+TRAINED_BY = (
+    *("task", "preset", "domains", "critic_sees_physics"),
+    *("checkpoint", "matmul_precision", "short"),
+)
+INFERRED_BY = ("episodes", "simulations", "refinements", "truth")
+SCORED_BY = ("points", "grid_episodes", "real_episodes", "truth")
 # Looks at a policy in a training, of which the best is taken: dear where MuJoCo steps
 LOOKS = {"goals": 10, "returns": 20}
 CHOOSING = 256  # episodes: of 15 looks at 64 the best was a lucky one, 0.95 and then 0.86
@@ -53,7 +56,7 @@ class Study:
         self.task, self.truth, self.settings, self.seed = task, truth, settings, seed
         self.out = out
         self.steps = min(128, task.max_steps)  # of a trajectory that inference sees
-        self.randomizer = DomainRandomizer(task.prior, seed=seed)
+        self.randomizer = DomainRandomizer(task.prior, seed=seed, pool=settings.domains or None)
         self._begun = self.randomizer.get_extra_state()
         self.env = task.make(task.environments, seed=seed, randomizer=self.randomizer)
         check_influence(self.env, self.randomizer, task.prior, steps=task.horizon)
@@ -75,14 +78,23 @@ class Study:
         file = self.out / f"{source}.json"
         found = recipe.kept(file, lambda: self._made(source))
         self._check_made_by(found.get("made_by"), file, *self._scoring(source))
-        if "at_real" not in found:
+        self._check_scores(found, file)
+        replayed = self.out / f"{source}.pt"  # a hundred megabytes
+        replayed.unlink(missing_ok=True)
+        return found
+
+    def _check_scores(self, found: dict[str, Any], file: Path) -> None:
+        """Refuse a damaged file, in which something is missing or of another kind."""
+        grids, curve = found.get("grids"), found.get("curve")
+        numbers = [found.get(name) for name in ("at_real", "under_prior", "real_episodes")]
+        whole = {"posterior", "solved"} <= found.keys() and isinstance(curve, list) and curve
+        whole = whole and all(isinstance(number, int | float) for number in numbers)
+        whole = whole and isinstance(grids, dict) and {*self.task.prior.names} == grids.keys()
+        if not whole:
             hint = "delete the file, and the policy is trained again"
             raise ValueError(
                 message("the scores of a policy", f"{file}: {sorted(found)}", hint=hint)
             )
-        replayed = self.out / f"{source}.pt"  # a hundred megabytes
-        replayed.unlink(missing_ok=True)
-        return found
 
     def _made(self, source: str) -> dict[str, Any]:
         """Return the scores, and of what they were made: folders are put together and resumed."""
@@ -172,13 +184,12 @@ class Study:
             refinement.load_state_dict(state)
             return refinement.posterior
         task, settings = self.task, self.settings
-        learner = self._learner()
-        learner.policy.load_state_dict(checkpoint.load(self.out / "prior_policy.pt"))
+        policy = self._collecting()
         statistics = SummaryStatistics(*task.summaries)
         measured = MEASURED if isinstance(task, GoalTask) else ("observation",)
         env = task.make(settings.episodes, seed=self.seed, randomizer=None)
         robot = SurrogateRobot(env, self.truth, max_steps=self.steps, measured=measured)
-        real = robot.rollouts(learner.policy, episodes=settings.episodes, key=(self.seed, "real"))
+        real = robot.rollouts(policy, episodes=settings.episodes, key=(self.seed, "real"))
         observed = statistics.together(comparable(real, horizon=self.steps))
         randomizer = DomainRandomizer(task.prior, seed=self.seed)
         rows = min(64, settings.simulations * settings.episodes)
@@ -187,7 +198,7 @@ class Study:
             randomizer.source = refinement.proposal()
             pairs = simulate(
                 env,
-                learner.policy,
+                policy,
                 statistics,
                 randomizer,
                 pairs=settings.simulations,
@@ -201,6 +212,17 @@ class Study:
         made_by = {"made_by": self._made_by(*INFERRED_BY)}
         checkpoint.save(file, refinement.state_dict() | made_by)
         return refinement.posterior
+
+    def _collecting(self) -> Any:
+        """Return the prior's policy, which collects at the robot."""
+        policy, file = self._learner().policy, self.out / "prior_policy.pt"
+        try:
+            policy.load_state_dict(checkpoint.load(file))
+        except (FileNotFoundError, RuntimeError) as error:  # torch's, of networks of other sizes
+            expected, hint = "the prior's policy, which collects", "delete prior.json beside it"
+            got = f"{file}: {type(error).__name__}"
+            raise ValueError(message(expected, got, hint=f"{hint} to train it again")) from error
+        return policy
 
     def _refinement(self) -> PosteriorRefinement:
         epochs = 40 if self.settings.short else 300

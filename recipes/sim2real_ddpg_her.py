@@ -93,7 +93,7 @@ def job(settings: Sim2RealFetch, out: Path) -> dict[str, Any]:
         "rounds": [{k: v for k, v in entry.items() if k != "curve"} for entry in rounds],
         "collecting_frames": run.collecting_frames,
         "success_under_prior": {"posterior": report(under_prior(run.learner.policy))},
-        "checkpoint": out / "checkpoint.pt",
+        "checkpoint": "checkpoint.pt",
     }
     curves = {"posterior": [point for entry in rounds for point in entry["curve"]]}
     if settings.video:

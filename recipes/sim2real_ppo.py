@@ -99,7 +99,7 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
             "parameters": list(task.prior.names),
             "true": truth.tolist(),
             "rounds": [{k: v for k, v in entry.items() if k != "curve"} for entry in done.rounds],
-            "checkpoint": out / "checkpoint.pt",
+            "checkpoint": "checkpoint.pt",
         }
         if settings.video:
             film = out / "posterior.gif"

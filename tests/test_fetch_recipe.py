@@ -1,5 +1,6 @@
 """The Fetch job as users run it, on the smallest task."""
 
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -237,11 +238,78 @@ def test_a_checkpoint_of_another_training_is_refused(recipes, tmp_path):
         with pytest.raises(ValueError, match=match):
             trained(**options)
     older = checkpoint.load(file)
-    del older["settings"], older["plan"], older["key"]
+    del older["settings"], older["plan"], older["key"], older["learner"]["settings"]
     checkpoint.save(file, older)
     assert trained(gamma=0.9) == curve
     with pytest.raises(ValueError, match=r"kept\.pt made with this learner's networks, got.*size"):
         trained(hidden=(8,))
+
+
+@pytest.mark.parametrize("decays", [True, False])
+def test_the_learner_is_told_how_far_a_training_is_if_its_rate_decays(recipes, decays):
+    from fetch_tasks import FETCH
+    from training import Plan, train
+
+    from torchrl_bayessim.transforms import DomainRandomizer
+
+    task, told = FETCH["fetch_reach"], []
+    randomizer = DomainRandomizer(task.prior)
+    env = task.make(2, seed=0, randomizer=randomizer)
+    learner = task.learner(env, seed=0, hidden=(16,), batch_size=32, updates_per_frame=0.02)
+    begin = learner.begin
+    learner.begin = lambda *batch, progress, **key: begin(
+        *batch, progress=told.append(progress) or progress, **key
+    )
+    train(learner, env, randomizer, Plan(4, 50, decays=decays), key=(0,), progress=False)
+    assert told == ([0.0, 0.25, 0.5, 0.75] if decays else [0.0] * 4)
+
+
+def test_both_recipes_ask_whether_the_parameters_do_anything(recipes, tmp_path):
+    import robustness
+    import robustness_study
+    import sim2real_ddpg_her
+    from fetch_tasks import FETCH
+
+    from torchrl_bayessim.errors import PhysicsError
+    from torchrl_bayessim.physics.mujoco import MujocoPhysics
+
+    alone = dataclasses.replace(  # the table's own friction is larger, and wins
+        FETCH["fetch_push"],
+        physics=lambda: MujocoPhysics(friction="geom_friction[object0,0]"),
+        environments=2,
+    )
+    truth = torch.tensor([0.3])
+    settings = robustness.Robustness(task="fetch_push", progress=False, domains=0)
+    with pytest.raises(PhysicsError, match="friction"):
+        robustness_study.Study(alone, truth, settings, tmp_path, seed=0)
+    settings = sim2real_ddpg_her.Sim2RealFetch(task="fetch_push", progress=False)
+    with pytest.raises(PhysicsError, match="friction"):
+        sim2real_ddpg_her.Run(alone, truth, settings, tmp_path)
+
+
+def test_a_score_is_of_the_same_episodes_for_every_policy(recipes):
+    from scoring import Score
+    from tasks import TASKS, Task
+
+    class Told(Task):
+        def scores(self, env, policy):
+            del policy
+            return env.reset()["theta"].sum(-1)
+
+    task = TASKS["cartpole"]
+    told = Told(**{name: getattr(task, name) for name in task.__match_args__})
+    score = Score(told, told.prior, episodes=16, seed=3)
+    first = score(None)
+    assert first.std() > 0.1
+    assert torch.equal(first, score(None))
+
+
+def test_a_gain_is_the_posteriors_over_the_priors(recipes):
+    from rounds import compare
+
+    found = compare(torch.tensor([3.0, 5.0]), torch.tensor([1.0, 1.0]), real=(1.0, [0.0, 2.0]))
+    assert found["gain"]["real_return"] == 3.0
+    assert found["baseline"]["real_return"] == 1.0
 
 
 def test_a_thinned_curve_has_means_and_carries_them_over_long_episodes(recipes):

@@ -61,7 +61,7 @@ def test_curves_and_paired_differences_are_there(finished):
     pairs = zip(real["posterior"]["values"], real["prior"]["values"], strict=True)
     assert real["posterior minus prior"]["values"] == pytest.approx([a - b for a, b in pairs])
     assert {"provenance", "posteriors"} <= result.keys()
-    assert result["setting"] == "fast"
+    assert result["preset"] == "fast"
     assert all(f"out={finished}" in run["provenance"]["command"] for run in result["runs"])
     kept = {f"{source}_policy.pt" for source in ("prior", "posterior", "oracle")}
     assert {path.name for path in finished.glob("seed1/*.pt")} == kept | {"posterior_state.pt"}
@@ -93,12 +93,16 @@ def test_a_policy_trained_after_a_break_is_the_same(finished, run, same_numbers,
         (["sources=posterior"], "expected the prior among the sources"),
         (["algorithm=td3"], "algorithm or a critic's view for Fetch tasks only, got 'td3'"),
         (["critic_sees_physics=true"], "for Fetch tasks only, got 'critic_sees_physics=True'"),
-        (["setting=weak"], "expected a setting, got 'weak'. Available: paper, strong"),
-        (["task=fetch_push", "setting=strong"], "got 'strong'. Available: fast, wide, paper"),
+        (["preset=weak"], "expected a preset, got 'weak'. Available: paper, strong"),
+        (["task=fetch_push", "preset=strong"], "got 'strong'. Available: fast, wide, paper"),
         (
-            ["task=fetch_slide", "setting=wide"],
+            ["task=fetch_slide", "preset=wide"],
             "that changes something, got 'wide on FetchSlide",
         ),
+        (["truth=0.5"], "truth= as numbers within the prior, length in [0.1, 2], masspole in [0.1"),
+        (["truth=0.5,3"], "as numbers within the prior, length in [0.1, 2], masspole in [0.1, 2]"),
+        (["truth=0.5,heavy"], "got '0.5,heavy'"),
+        (["domains=-2"], "expected at least -1 domains=, got -2"),
         (["real_episodes=0"], "expected real_episodes= to be positive, got 0"),
         (["episodes=0"], "expected episodes= to be positive, got 0"),
         (["simulations=1"], "expected at least 8 simulations=, got 1"),
@@ -236,6 +240,40 @@ def test_intervals_are_students(run):
 ROBOT = torch.tensor([1.5, 1.2])  # a half-length and a mass that are not nominal
 
 
+def test_seeds_that_ran_by_themselves_become_one_figure(run, same_numbers, tmp_path):
+    asked = ["task=fetch_reach", "sources=oracle", "short=true", "points=3", "video=false"]
+    asked.append("progress=false")
+    run(*asked, "seeds=2", f"out={tmp_path / 'together'}")
+    run(*asked, "seeds=1", f"out={tmp_path / 'apart'}")
+    for more in (["seed=1"], ["seed=0", "seeds=2"]):
+        run(f"resume={tmp_path / 'apart'}", *more, "progress=false")
+    same_numbers(tmp_path / "apart", tmp_path / "together")
+
+
+def test_the_robot_may_be_another(run, tmp_path):
+    asked = ["task=fetch_reach", "sources=oracle", "truth=120", f"out={tmp_path}"]
+    run(*TINY, *asked)
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["true"] == [120]
+    (curve,) = result["curves"]
+    assert curve["grid"] == [10, 105, 120, 200]
+    assert curve["return_mean"][2] == pytest.approx(result["at_real"]["oracle"]["mean"])
+
+
+def test_a_table_tells_the_code_of_policies_from_several_commits(finished, run):
+    import robustness_report
+
+    result = json.loads((finished / "result.json").read_text())
+    assert "at commits" not in robustness_report.table(result)
+    for entry in result["runs"]:
+        if entry["source"] == "oracle":
+            del entry["provenance"]
+        else:
+            entry["provenance"]["commit"] = "abc"
+    told = "Policies were trained at commits abc (prior, posterior), older code (oracle)."
+    assert told in robustness_report.table(result)
+
+
 def a_study(folder, **settings):
     import robustness
     from robustness_study import Study
@@ -249,7 +287,7 @@ def a_study(folder, **settings):
 
 def test_a_policy_is_trained_under_the_source_that_its_name_says(run, tmp_path):
     del run
-    study = a_study(tmp_path, simulations=64)
+    study = a_study(tmp_path, simulations=64, domains=0)
     trained_under, seen = {}, []
 
     class Watching(PPO):
@@ -272,6 +310,68 @@ def test_a_policy_is_trained_under_the_source_that_its_name_says(run, tmp_path):
     assert (away.abs() < 4 * spread / len(trained_under["posterior"]) ** 0.5).all()
     assert spread[0] < 0.7 * trained_under["prior"].std(0)[0]  # which prior draws would not have
     assert trained_under["posterior"].std(0)[0] < 0.7 * trained_under["prior"].std(0)[0]
+
+
+def test_domains_are_drawn_once_and_told(run, tmp_path):
+    run(*CARTPOLE, "domains=2", "sources=prior", "progress=false", "video=false", f"out={tmp_path}")
+    assert "each policy saw 2 domains" in (tmp_path / "table.md").read_text()
+    study, seen = a_study(tmp_path / "own", domains=2), []
+
+    class Watching(PPO):
+        def update(self, batch, **options):
+            seen.append(batch["theta"])
+            return super().update(batch, **options)
+
+    study._learner = lambda: Watching(study.env, seed=0, **study.task.ppo)
+    study._trained("prior", study._learner())
+    assert len(torch.cat(seen).flatten(0, -2).unique(dim=0)) == 2
+
+
+def test_no_episode_that_is_reported_chose_a_checkpoint(run, tmp_path, monkeypatch):
+    del run
+    import robustness_study
+
+    asked = []
+
+    class Noted(robustness_study.Score):
+        def __init__(self, *task_and_source, seed, **options):
+            asked.append(seed)
+            super().__init__(*task_and_source, seed=seed, **options)
+
+    monkeypatch.setattr(robustness_study, "Score", Noted)
+    study = a_study(tmp_path)
+    study._select()
+    (choosing,) = asked
+    study._scores(study._learner().policy)
+    assert len(asked) > 3
+    assert choosing not in asked[1:]
+    assert study.seed not in asked
+
+
+def test_the_priors_own_policy_collects_at_the_robot(run, tmp_path, monkeypatch):
+    del run
+    import robustness_study
+
+    acting = []
+
+    class Watched(robustness_study.SurrogateRobot):
+        def rollouts(self, policy, **options):
+            acting.append({n: v.clone() for n, v in policy.state_dict().items()})
+            return super().rollouts(policy, **options)
+
+    monkeypatch.setattr(robustness_study, "SurrogateRobot", Watched)
+    study = a_study(tmp_path, simulations=32)
+    with pytest.raises(ValueError, match=r"prior's policy, which collects, got .*NotFound.*Try"):
+        study._posterior()
+    study.scored("prior")
+    study._posterior()
+    kept = checkpoint.load(tmp_path / "prior_policy.pt")
+    assert kept.keys() == acting[0].keys()
+    assert all(torch.equal(kept[name], acting[0][name]) for name in kept)
+    (tmp_path / "posterior_state.pt").unlink()
+    checkpoint.save(tmp_path / "prior_policy.pt", {n: v[..., :1] for n, v in kept.items()})
+    with pytest.raises(ValueError, match=r"which collects, got .*RuntimeError.*delete prior\.json"):
+        study._posterior()
 
 
 def test_scores_stand_at_their_own_point_of_the_grid(run, tmp_path):
@@ -324,9 +424,13 @@ def test_a_posterior_of_another_run_is_refused(finished, run, tmp_path, capsys):
     assert "posterior_state.pt of a run with simulations=24, got 99" in capsys.readouterr().err
 
 
-def test_a_file_without_scores_is_refused(finished, run, tmp_path, capsys):
+@pytest.mark.parametrize(
+    "damage", [{"at_real": None}, {"curve": []}, {"grids": {}}, {"under_prior": "0.3"}]
+)
+def test_a_file_without_scores_is_refused(damage, finished, run, tmp_path, capsys):  # noqa: PLR0917
     shutil.copytree(finished / "seed0", tmp_path / "seed0")
-    (tmp_path / "seed0" / "prior.json").write_text("{}")
+    kept = tmp_path / "seed0" / "prior.json"
+    kept.write_text(json.dumps(json.loads(kept.read_text()) | damage))
     with pytest.raises(SystemExit, match="2"):
         run(*TINY, *SOURCES, f"out={tmp_path}")
     assert "expected the scores of a policy" in capsys.readouterr().err

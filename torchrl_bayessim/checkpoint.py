@@ -69,7 +69,7 @@ def load(path: str | os.PathLike[str]) -> dict[str, Any]:
             message(
                 "a whole checkpoint written by this package",
                 f"{path}: {type(e).__name__}, {len(data)} bytes",
-                hint="an earlier checkpoint of the same run",
+                hint="another checkpoint, or begin that run anew",
             )
         ) from e
     if not isinstance(content, dict) or content.get("format") != _FORMAT or "state" not in content:

@@ -118,10 +118,11 @@ def test_targets_are_bounded_by_what_returns_can_be(value, terminated, target):
         "terminated": torch.full((3, 1), terminated),
         "state_value": torch.full((3, 1), value),
     }
-    found = BoundedTD0(gamma=0.98, rewards=(-1.0, 0.0)).value_estimate(
-        TensorDict({"next": step}, [3])
-    )
+    estimator = BoundedTD0(gamma=0.98, rewards=(-1.0, 0.0))
+    found = estimator.value_estimate(TensorDict({"next": step}, [3]))
     assert found.flatten().tolist() == pytest.approx([target] * 3)
+    in_training = estimator.bounded(TensorDict(step, [3]), step["state_value"])
+    assert in_training.flatten().tolist() == pytest.approx([target] * 3)
 
 
 @pytest.mark.parametrize("kind", LOSSES)

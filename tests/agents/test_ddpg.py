@@ -171,6 +171,60 @@ def test_statistics_are_those_of_observations_and_of_meant_and_reached_goals(epi
     assert learner.state.full(episodes).abs().max() <= 5
 
 
+def test_statistics_go_on_with_every_batch(episodes):
+    learner = DDPG(push(), goal_reward, critic_keys=["theta"], **SMALL)
+    for key, shift in enumerate((0.0, 4.0)):
+        batch = episodes.clone()
+        batch["observation"] += shift
+        batch["theta"] += shift
+        learner.update(batch, key=(key,))
+    observed = episodes["observation"].flatten(0, 1).double().mean(0)
+    torch.testing.assert_close(learner.state.normalizer.mean[:25], observed + 2.0)
+    theta = episodes["theta"].flatten(0, 1).double().mean(0)
+    torch.testing.assert_close(learner.state.critic_normalizer.mean, theta + 2.0)
+
+
+def test_batches_mix_relabelled_transitions_with_others(episodes):
+    learner = DDPG(push(), goal_reward, relabelled=0.5, **SMALL)
+    marked = episodes.clone()
+    for goal in (marked["desired_goal"], marked["next", "desired_goal"]):
+        goal[:] = 9.0
+    marked["next", "reward"][:] = -1.0
+    learner.buffer.extend(marked.select(*learner.kept_keys))
+    learner.state.observe(marked)
+    own = learner.state.full(marked)[0, 0, 25:28]  # of the goal, as the networks see it
+    batches = list(learner._replayed(20, key=(0,)))
+    shares = [(batch["state"][:, 25:28] == own).all(-1).double().mean() for batch in batches]
+    assert 0.3 < min(shares) <= max(shares) < 0.7
+
+
+def test_a_critic_that_has_blown_up_stops_the_training(episodes):
+    learner = DDPG(push(), goal_reward, **SMALL)
+    wild = learner._tensors()["value_network_params.module.layers.0.weight"]
+    wild *= 1e6
+    with pytest.raises(SimulationError, match=r"a loss below 2\.5e\+05 of the critic, got .*Try"):
+        learner.update(episodes, key=(0,))
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"algorithm": "td3"}, "a state of DDPG with algorithm='td3', got 'ddpg'"),
+        ({"hidden": (16,)}, r"with hidden=\[16\], got \[32, 32\]"),
+        ({"capacity": 2000}, "with capacity=2000, got 1000"),
+        ({"critic_keys": ["theta"]}, r"with critic_keys=\['theta'\], got \[\]"),
+    ],
+)
+def test_a_state_of_another_learner_is_refused(episodes, options, match):
+    learner = DDPG(push(), goal_reward, **SMALL)
+    learner.update(episodes, key=(0,))
+    other = DDPG(push(), goal_reward, **SMALL | options)
+    before = copy.deepcopy(other._tensors())
+    with pytest.raises(ValueError, match=match):
+        other.load_state_dict(learner.state_dict())
+    assert not changed(before, other._tensors())
+
+
 def test_resumed_it_learns_the_same(episodes):
     learner = DDPG(push(), goal_reward, algorithm="td3", **SMALL)
     learner.update(episodes, key=(0,))

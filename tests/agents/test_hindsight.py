@@ -146,6 +146,50 @@ def test_unfinished_episodes_are_refused():
         buffer.extend(tagged(0, lengths=(101,)))
 
 
+@pytest.mark.parametrize(
+    "key",
+    [
+        "achieved_goal",
+        "desired_goal",
+        ("next", "achieved_goal"),
+        ("next", "reward"),
+        ("next", "done"),
+    ],
+)
+def test_what_is_no_goal_environments_episodes_is_refused(key):
+    buffer = HindsightReplayBuffer(near, capacity=100)
+    episodes = tagged(0, lengths=(5,))
+    with pytest.raises(ValueError, match=r"a goal environment's episodes, got .no .*Available"):
+        buffer.extend(episodes.exclude(key))
+    if key != ("next", "done"):
+        episodes[key][0, 2] = torch.nan
+        with pytest.raises(ValueError, match=r"finite .*, got 'NaN or infinity"):
+            buffer.extend(episodes)
+    with pytest.raises(ValueError, match=r"batch size \[N, T\], got \[5\]"):
+        buffer.extend(tagged(0, lengths=(5,))[0])
+    assert len(buffer) == 0
+    with pytest.raises(ValueError, match=r"episodes to sample from, got 'an empty replay.*Try"):
+        buffer.sample(3)
+
+
+def test_a_goal_that_is_not_a_number_is_not_reached():
+    place = torch.zeros(2, 3)
+    place[1, 0] = torch.nan
+    assert goal_reward(place, torch.zeros(2, 3)).tolist() == [0, -1]
+
+
+@pytest.mark.parametrize(("capacity", "held"), [(20, "full"), (100, "full"), (12, "larger")])
+def test_contents_of_a_buffer_of_another_capacity_are_refused(capacity, held):
+    buffer = HindsightReplayBuffer(near, capacity=37)
+    for first in range(5 if held == "full" else 2):
+        buffer.extend(tagged(first, lengths=(10,)))
+    other = HindsightReplayBuffer(near, capacity=capacity)
+    other.extend(tagged(9, lengths=(10,)))
+    with pytest.raises(ValueError, match=rf"capacity={capacity}, got '\d+ of a {held} one"):
+        other.restore(buffer.contents())
+    assert len(other) == 10
+
+
 def far(achieved, desired):
     return -near(achieved, desired)
 

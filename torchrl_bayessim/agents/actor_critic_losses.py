@@ -107,6 +107,11 @@ class _Bounded(LossModule):
             target_critic=_holding(getattr(self, critic), parameters[f"target_{critic}"]),
         )
 
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """The least and the greatest target."""
+        return self._value_estimator.bounds
+
     def policy_loss(self, batch: TensorDictBase) -> Tensor:
         """Return the actor's loss, by the (first) critic."""
         state = batch.get("state")

@@ -32,6 +32,8 @@ from .owed_updates import OwedUpdates
 from .replayed_batches import ReplayedBatches
 
 _LOSSES = {"ddpg": BoundedDDPGLoss, "td3": BoundedTD3Loss}
+_SHAPING = ("algorithm", "hidden", "critic_keys", "capacity")  # what a state fits into
+_BEYOND = 10.0  # times the range of its targets that a critic is off when it has blown up
 
 
 class DDPG:
@@ -170,6 +172,8 @@ class DDPG:
         self._replayed = ReplayedBatches(
             self.buffer, self.state, self._bounds, batch_size=batch_size, seed=seed
         )
+        low, high = self._loss.bounds
+        self._most = (_BEYOND * (high - low)) ** 2
         self._targets = SoftUpdateAtOnce(self._loss, tau=tau)
         self._owed: tuple[OwedUpdates, dict[str, Any]] | None = None
         self._report: dict[str, float] = {}
@@ -196,8 +200,9 @@ class DDPG:
             ValueError: The batch lacks an entry, its rows are no whole episodes, its rewards are
                 not those of ``reward`` or beyond ``rewards``, the replay buffer would hold less
                 than one batch, or no update is due for so few transitions.
-            SimulationError: A value in the batch, a loss or a parameter is not finite. The networks
-                are then as they were before.
+            SimulationError: A value in the batch, a loss or a parameter is not finite, or the
+                critic is off by ten times the range of its targets. The networks are then as they
+                were before.
         """
         self.begin(batch, key=key, progress=progress)
         return self.finish()
@@ -318,14 +323,10 @@ class DDPG:
 
     def _step(self, part: str, loss: Tensor) -> float:
         value = loss.item()
-        if not math.isfinite(value):
-            raise SimulationError(
-                message(
-                    f"a finite loss of the {part}",
-                    value,
-                    hint="a smaller learning rate, or rewards within the given range",
-                )
-            )
+        if not math.isfinite(value) or (part == "critic" and value > self._most):
+            kind = "a finite loss" if not math.isfinite(value) else f"a loss below {self._most:.3g}"
+            hint = "a smaller learning rate, or rewards within the given range"
+            raise SimulationError(message(f"{kind} of the {part}", value, hint=hint))
         self._optimizers[part].zero_grad()
         loss.backward()
         self._optimizers[part].step()
@@ -350,10 +351,20 @@ class DDPG:
         Updates that are still owed are made before.
         """
         self.finish()
-        return self._learned() | {"buffer": self.buffer.contents()}
+        made_by = {"settings": {name: self.settings[name] for name in _SHAPING}}
+        return self._learned() | {"buffer": self.buffer.contents()} | made_by
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from ``state``."""
+        """Continue from ``state``.
+
+        Raises:
+            ValueError: It is of a learner with other networks, or another replay buffer.
+        """
+        made_by = state.get("settings", {})  # which older states do not say
+        for name in _SHAPING:
+            own = self.settings[name]
+            if made_by.get(name, own) != own:
+                raise ValueError(message(f"a state of DDPG with {name}={own!r}", made_by[name]))
         self._owed = None
         self._learn(state)
         self.buffer.restore(state["buffer"])

@@ -104,14 +104,16 @@ class HindsightReplayBuffer(HERReplayBuffer):
             episodes: Batch size ``[N, T]``; each row one or several episodes, the last one ended.
 
         Raises:
-            ValueError: A row ends within an episode, or holds more than fits. The function of the
-                reward gives another one than the environment in a tenth of the transitions or in
-                half of those that are not rewarded like most, none for some, or no more for a goal
-                that is reached than for one far away.
+            ValueError: An entry is missing, or goals or rewards are not finite. A row ends within
+                an episode, or holds more than fits. The function of the reward gives another one
+                than the environment in a tenth of the transitions or in half of those that are not
+                rewarded like most, none for some, or no more for a goal that is reached than for
+                one far away.
         """
+        _check_entries(episodes)
         done = episodes["next", "done"].reshape(episodes.batch_size)
-        if episodes.ndim != 2 or not done[:, -1].all():
-            rows = (~done[:, -1]).nonzero().flatten().tolist() if done.ndim == 2 else done.shape
+        if not done[:, -1].all():
+            rows = (~done[:, -1]).nonzero().flatten().tolist()
             raise ValueError(
                 message(
                     "episodes [N, T] that end with their row",
@@ -151,10 +153,21 @@ class HindsightReplayBuffer(HERReplayBuffer):
         return {"entries": dict(entries.items()), "cursor": int(self._writer._cursor)}
 
     def restore(self, contents: Mapping[str, Any]) -> None:
-        """Hold what `contents` returned, in the same places."""
+        """Hold what `contents` returned, in the same places.
+
+        Raises:
+            ValueError: They are of a full buffer of another capacity, or more than fit.
+        """
+        entries = contents.get("entries", {})
+        count = len(entries[_FOLLOWING]) if entries else 0
+        full = count and contents["cursor"] < count  # where it is cut, episodes go round the end
+        if count > self.capacity or (full and count != self.capacity):
+            expected = f"the transitions of a buffer with capacity={self.capacity}"
+            raise ValueError(
+                message(expected, f"{count} of {'a full' if full else 'a larger'} one")
+            )
         self.empty()
-        if contents:
-            entries = contents["entries"]
+        if entries:
             held = TensorDict(dict(entries), [len(entries[_FOLLOWING])]).unflatten_keys(".")
             super().extend(held)
             self._writer._cursor = contents["cursor"]
@@ -168,6 +181,11 @@ class _MovingFirst(Sampler):
         self.share, self.moving = share, moving
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:
+        if not len(storage):
+            hint = "extend it by whole episodes first"
+            raise ValueError(
+                message("episodes to sample from", "an empty replay buffer", hint=hint)
+            )
         held = storage[:]
         index = torch.randint(len(held), (batch_size,))
         first = int(batch_size * self.share)
@@ -192,14 +210,27 @@ def _rewards(reward: GoalReward, steps: TensorDictBase) -> Tensor:
         return reward(steps["next", "achieved_goal"], steps["desired_goal"])
 
 
+def _check_entries(episodes: TensorDictBase) -> None:
+    """Refuse what is no batch of a goal environment's episodes, or holds no numbers."""
+    if episodes.ndim != 2:
+        raise ValueError(message("episodes of batch size [N, T]", list(episodes.batch_size)))
+    goals = "achieved_goal", "desired_goal", ("next", "achieved_goal")
+    for key in (*goals, ("next", "reward"), ("next", "done")):
+        value = episodes.get(key, None)
+        if value is None:
+            expected = "a goal environment's episodes"
+            available = sorted(map(str, episodes.keys(include_nested=True)))
+            raise ValueError(message(expected, f"no {key!r}", available=available))
+        if not value.isfinite().all():
+            raise ValueError(message(f"finite {key!r}", "NaN or infinity in some transitions"))
+
+
 def _check_reward(reward: GoalReward, episodes: TensorDictBase) -> None:
     """Refuse a reward that is not the environment's: relabelled transitions would not fit others.
 
     It may differ in some, where rounding or a sensor carries a goal over a threshold.
     """
-    own = episodes.get(("next", "reward"), None)
-    if own is None:
-        return
+    own = episodes["next", "reward"]
     found, shape = _rewards(reward, episodes), tuple(episodes.batch_size)
     sizes = shape, (*shape, 1)
     if not isinstance(found, Tensor) or found.shape not in sizes:

@@ -139,7 +139,8 @@ def goal_reward(achieved: Tensor, desired: Tensor, *, dense: bool = False) -> Te
     have earned.
     """
     distance = (achieved - desired).norm(dim=-1)
-    return -distance if dense else -(distance > _REACHED).to(distance.dtype)
+    missed = ~(distance <= _REACHED)  # so is a goal that is not a number
+    return -distance if dense else -missed.to(distance.dtype)
 
 
 def euler(matrix: Tensor) -> Tensor:
