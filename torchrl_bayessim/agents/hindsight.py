@@ -180,7 +180,7 @@ class _MovingFirst(Sampler):
         super().__init__()
         self.share, self.moving = share, moving
 
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:
+    def sample(self, storage: Any, batch_size: int) -> tuple[Tensor, dict]:
         if not len(storage):
             hint = "extend it by whole episodes first"
             raise ValueError(
