@@ -16,6 +16,12 @@ def interval(values: list[float]) -> dict[str, float]:
     return {"mean": mean, "low": mean - half, "high": mean + half, "values": values}
 
 
+def of_mean(values: Tensor) -> tuple[float, list[float]]:
+    """Return the mean and its 95 % Student interval."""
+    found = interval(values.tolist())
+    return found["mean"], [found["low"], found["high"]]
+
+
 def wilson(hits: int, n: int) -> tuple[float, float]:
     """Return the 95 % interval of a proportion (Wilson 1927); all of [0, 1] of no cases."""
     if not n:

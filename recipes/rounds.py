@@ -10,6 +10,7 @@ from typing import Any
 import kept_json
 import recipe
 import torch
+from intervals import of_mean
 from tasks import Task
 from torch import Tensor
 from torchrl.record.loggers import Logger
@@ -96,18 +97,11 @@ def describe(
 
 def compare(posterior: Tensor, prior: Tensor, *, real: tuple[float, list[float]]) -> dict[str, Any]:
     """Return the entries of the baseline, whose score is ``real``; episodes are paired."""
-    gain, interval = confidence(posterior - prior)
+    gain, interval = of_mean(posterior - prior)
     return {
         "baseline": {"source": "prior", "real_return": real[0], "real_return_ci": real[1]},
         "gain": {"real_return": gain, "real_return_ci": interval},
     }
-
-
-def confidence(values: Tensor) -> tuple[float, list[float]]:
-    """Return mean and 95 % interval of the mean."""
-    mean = values.mean().item()
-    half = 1.96 * values.std().item() / math.sqrt(len(values))
-    return mean, [mean - half, mean + half]
 
 
 def shown(mean: float, interval: list[float], *, digits: int = 1) -> str:

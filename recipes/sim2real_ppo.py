@@ -24,7 +24,8 @@ from typing import Any
 
 import recipe
 from collectors import collectors
-from rounds import Journal, compare, confidence, describe, draw_pictures, sentence, shown
+from intervals import of_mean
+from rounds import Journal, compare, describe, draw_pictures, sentence, shown
 from scoring import Score
 from tasks import TASKS, Task, true_parameters
 from torch import Tensor
@@ -90,7 +91,7 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
     planned = loop.planned_frames
     with there or nullcontext(), Baseline(settings, frames=planned) as baseline:
         for turn in loop:
-            earned = confidence(score(learner.policy))
+            earned = of_mean(score(learner.policy))
             done.add(turn.index, describe(turn, task, truth, real=earned))
             said = f"the robot earns {shown(*earned)}"
             print(sentence(turn, task, done.rounds[-1], said=said))
@@ -110,7 +111,7 @@ def job(settings: Sim2Real, out: Path) -> dict[str, Any]:
             weights, curves["prior"] = baseline.result()
             learner.policy.load_state_dict(weights)
             baseline_returns = score(learner.policy)
-            earned = confidence(baseline_returns)
+            earned = of_mean(baseline_returns)
             result |= compare(returns, baseline_returns, real=earned)
             print(f"prior only: the robot earns {shown(*earned)} after as many frames")
     posterior = loop.refinement.posterior
