@@ -195,7 +195,7 @@ def test_batches_mix_relabelled_transitions_with_others(episodes):
     own = learner.state.full(marked)[0, 0, 25:28]  # of the goal, as the networks see it
     batches = list(learner._replayed(20, key=(0,)))
     shares = [(batch["state"][:, 25:28] == own).all(-1).double().mean() for batch in batches]
-    assert 0.3 < min(shares) <= max(shares) < 0.7
+    assert 0.2 < min(shares) <= max(shares) < 0.8  # five standard errors
 
 
 def test_a_critic_that_has_blown_up_stops_the_training(episodes):
