@@ -94,7 +94,7 @@ def test_learning_curves_have_a_band_for_several_seeds_only():
     (axes,) = figure.axes
     bands = [c for c in axes.collections if isinstance(c, FillBetweenPolyCollection)]
     assert len(bands) == 1
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["many", "one"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["many", "one"]
 
 
 @pytest.mark.parametrize(("end", "shown"), [(2.0, "0.5"), (4000.0, "1k")])
@@ -103,7 +103,7 @@ def test_curves_over_physics_have_marks_and_plain_numbers(end, shown, tmp_path):
     figure = learning_curves({"prior": (x, torch.rand(3, 5))}, marks={"the robot": end / 4})
     (axes,) = figure.axes
     assert any(list(line.get_xdata()) == [end / 4, end / 4] for line in axes.lines)
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["prior", "the robot"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["prior", "the robot"]
     figure.savefig(tmp_path / "curves.png")
     assert any(label.get_text().startswith(shown) for label in axes.get_xticklabels())
 

@@ -162,14 +162,10 @@ def learning_curves(
         _thousands(axes)
     several = any(np.atleast_2d(_array(y)).shape[0] > 1 for _, y in curves.values())
     title = "mean, least and greatest of the seeds" if several else None
-    crowded = len(curves) > 2  # where no corner of the axes is empty
-    look = {"fontsize": 9, "title": title, "title_fontsize": 8, **_LEGEND}
-    if crowded:
-        longest = max(map(len, axes.get_legend_handles_labels()[1]))
-        columns = {"ncols": max(2, 68 // (4 + longest)), "columnspacing": 1.0, "handlelength": 1.2}
-        figure.legend(loc="outside upper center", **columns, **look)
-    else:
-        axes.legend(**look)
+    longest = max(map(len, axes.get_legend_handles_labels()[1]))
+    columns = {"ncols": max(2, 68 // (4 + longest)), "columnspacing": 1.0, "handlelength": 1.2}
+    look = {"fontsize": 9, "title": title, "title_fontsize": 8, **columns, **_LEGEND}
+    figure.legend(loc="outside upper center", **look)  # bands leave no corner empty
     return figure
 
 
