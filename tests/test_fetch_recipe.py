@@ -10,6 +10,7 @@ import torch
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 TINY = ["task=fetch_reach", "short=true", "progress=false", "rounds=1", "simulations=8"]
+LATER = {"collecting": False, "prior": True}  # whether its learning rate falls
 LEARNER = ["critic_sees_physics=true", "algorithm=td3"]
 
 
@@ -74,6 +75,13 @@ def test_the_loop_forgets_what_was_collected_under_the_prior(finished):
     assert replayed["collecting"] == 2 * 8 * 50
     assert replayed["checkpoint"] == frames
     assert replayed["prior"] == replayed["collecting"] + frames  # the same prior: kept
+
+
+def test_the_learning_rate_of_the_baseline_falls_as_in_the_loop(finished):
+    from torchrl_bayessim import checkpoint
+
+    plans = {name: checkpoint.load(finished / f"{name}.pt")["plan"] for name in LATER}
+    assert {name: plan["decays"] for name, plan in plans.items()} == LATER
 
 
 def test_learning_curves_go_on_where_the_collecting_policy_ends(finished, recipes):
