@@ -27,7 +27,7 @@ from ..randomness import isolated
 from ..scalars import check_number
 from .actor_critic_losses import BoundedDDPGLoss, BoundedTD3Loss, SoftUpdateAtOnce
 from .goal_networks import GOAL_KEYS, Actor, Critic, GoalState, action_bounds, goal_policy
-from .hindsight import GoalReward, HindsightReplayBuffer
+from .hindsight import GoalReward, HindsightReplayBuffer, required
 from .owed_updates import OwedUpdates
 from .replayed_batches import ReplayedBatches
 
@@ -266,12 +266,7 @@ class DDPG:
 
     def _check(self, batch: TensorDictBase) -> None:
         for key in self.kept_keys:
-            value = batch.get(key, None)
-            if value is None:
-                available = sorted(map(str, batch.keys(include_nested=True)))
-                raise ValueError(
-                    message("a batch of a goal environment", f"no {key!r}", available=available)
-                )
+            value = required(batch, key, of="a batch of a goal environment")
             if value.is_floating_point() and not value.isfinite().all():
                 raise SimulationError(
                     message(f"finite {key!r} in the batch", "NaN or infinity in some frames")
@@ -323,8 +318,9 @@ class DDPG:
 
     def _step(self, part: str, loss: Tensor) -> float:
         value = loss.item()
-        if not math.isfinite(value) or (part == "critic" and value > self._most):
-            kind = "a finite loss" if not math.isfinite(value) else f"a loss below {self._most:.3g}"
+        finite = math.isfinite(value)
+        if not finite or (part == "critic" and value > self._most):
+            kind = f"a loss below {self._most:.3g}" if finite else "a finite loss"
             hint = "a smaller learning rate, or rewards within the given range"
             raise SimulationError(message(f"{kind} of the {part}", value, hint=hint))
         self._optimizers[part].zero_grad()

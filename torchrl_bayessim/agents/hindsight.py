@@ -8,7 +8,7 @@ goals are counted on from there: round the end of the storage, and never into an
 
 from __future__ import annotations
 
-__all__ = ["GoalReward", "HindsightReplayBuffer"]
+__all__ = ["GoalReward", "HindsightReplayBuffer", "required"]
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -210,17 +210,26 @@ def _rewards(reward: GoalReward, steps: TensorDictBase) -> Tensor:
         return reward(steps["next", "achieved_goal"], steps["desired_goal"])
 
 
+def required(steps: TensorDictBase, key: Any, *, of: str) -> Tensor:
+    """Return an entry.
+
+    Raises:
+        ValueError: There is none: these are not the steps ``of`` what was expected.
+    """
+    value = steps.get(key, None)
+    if value is None:
+        available = sorted(map(str, steps.keys(include_nested=True)))
+        raise ValueError(message(of, f"no {key!r}", available=available))
+    return value
+
+
 def _check_entries(episodes: TensorDictBase) -> None:
     """Refuse what is no batch of a goal environment's episodes, or holds no numbers."""
     if episodes.ndim != 2:
         raise ValueError(message("episodes of batch size [N, T]", list(episodes.batch_size)))
     goals = "achieved_goal", "desired_goal", ("next", "achieved_goal")
     for key in (*goals, ("next", "reward"), ("next", "done")):
-        value = episodes.get(key, None)
-        if value is None:
-            expected = "a goal environment's episodes"
-            available = sorted(map(str, episodes.keys(include_nested=True)))
-            raise ValueError(message(expected, f"no {key!r}", available=available))
+        value = required(episodes, key, of="a goal environment's episodes")
         if not value.isfinite().all():
             raise ValueError(message(f"finite {key!r}", "NaN or infinity in some transitions"))
 
