@@ -10,7 +10,8 @@ the mutual information of parameters and measurements is
     \sum_p \tfrac{(y_p - \bar y)}{\sigma} \tfrac{(y_p - \bar y)^T}{\sigma}\Big)
 
 (Lindley, 1956; for small deviations of the parameters this is the D-optimality of Fisher's
-information matrix). At most P - 1 directions count, so the determinant is that of a P by P matrix.
+information matrix). At most P - 1 directions count, so the determinant is that of a P by P matrix,
+or of one with a row for each reading where those are fewer.
 The actions are found by the cross-entropy method on smooth sequences (Rubinstein & Kroese, 2004).
 """
 
@@ -78,9 +79,9 @@ def expected_information(outputs: Tensor, noise: Tensor) -> Tensor:
     good = y.isfinite().all(-1).all(-1)
     y = torch.where(good[:, None, None], y, 0.0)
     y = y - y.mean(1, keepdim=True)
-    gram = y @ y.mT / (y.shape[1] - 1)
-    identity = torch.eye(y.shape[1], dtype=y.dtype)
-    return 0.5 * torch.linalg.slogdet(identity + gram).logabsdet
+    rows = y if y.shape[1] <= y.shape[2] else y.mT  # det(1 + y y^T) = det(1 + y^T y)
+    spread = torch.linalg.eigvalsh(rows @ rows.mT / (y.shape[1] - 1)).clamp(min=0)
+    return 0.5 * spread.log1p().sum(-1)
 
 
 def excite(
