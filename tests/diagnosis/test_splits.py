@@ -25,28 +25,50 @@ def names(logs):
     return [log.name for log in logs]
 
 
-def test_what_shows_in_two_training_runs_alone_is_dealt_to_both_splits():
+def test_what_shows_in_two_training_runs_alone_is_dealt_to_all_splits():
     parts = split(rides())
     assert {name: len(logs) for name, logs in parts.items()} == {
         "train": 4, "validation": 2, "test": 2,
     }  # fmt: skip
-    left = {"train": np.array([9.0, 1.1, 0.9, 30.0]), "validation": np.array([1.0, 1.05])}
+    left = {
+        "train": np.array([9.0, 1.1, 0.9, 30.0]),
+        "validation": np.array([1.0, 1.05]),
+        "test": np.array([1.2, 1.02]),
+    }
     again = dealt_anew(parts, left)
     assert names(again["train"])[0] == names(parts["train"])[3]
     assert names(again["validation"])[0] == names(parts["train"])[0]
-    assert names(again["test"]) == names(parts["test"])
-    assert len(again["train"]) == 4
-    assert len(again["validation"]) == 2
+    assert names(again["test"])[0] == names(parts["test"])[0]
+    assert {name: len(logs) for name, logs in again.items()} == {
+        "train": 4, "validation": 2, "test": 2,
+    }  # fmt: skip
+    assert sorted(sum(map(names, again.values()), [])) == sorted(names(rides()))
+
+
+def test_the_run_in_which_far_more_is_missing_than_in_any_other_trains():
+    parts = split(rides())
+    shown = {
+        "train": np.array([3.0, 2.0, 2.0, 2.0]),
+        "validation": np.array([3.0, 2.0]),
+        "test": np.array([2.0, 9.0]),
+    }
+    assert names(dealt_anew(parts, shown)["train"])[0] == names(parts["test"])[1]
+    shown["test"][1] = 3.9  # less than half as much again
+    assert dealt_anew(parts, shown) is parts
 
 
 @pytest.mark.parametrize(
-    ("train", "validation"),
-    [([90.0, 8.0, 9.0, 7.0], [1.0, 1.6]), ([30.0, 1.0, 1.0, 1.0], [1.0, 1.0])],
-    ids=["shows in both", "shows in one run"],
+    ("train", "validation", "test"),
+    [
+        ([90.0, 8.0, 9.0, 7.0], [1.0, 1.6], [2.0, 1.0]),
+        ([30.0, 1.0, 1.0, 1.0], [1.0, 1.0], [1.0, 1.0]),
+        ([1.4, 1.0, 1.0, 1.0], [1.0, 1.0], [1.3, 1.2]),
+    ],
+    ids=["shows in all", "shows in one run", "shows in none"],
 )
-def test_runs_stay_where_both_splits_show_a_gap_or_only_one_run_has_it(train, validation):
+def test_runs_stay_where_all_splits_show_a_gap_or_only_one_run_has_it(train, validation, test):
     parts = split(rides())
-    left = {"train": np.array(train), "validation": np.array(validation)}
+    left = {"train": np.array(train), "validation": np.array(validation), "test": np.array(test)}
     assert dealt_anew(parts, left) is parts
 
 
@@ -56,7 +78,7 @@ def test_pieces_of_runs_still_train_and_few_runs_are_known():
     piece = replace(logs[0], name="piece", **rows)
     parts = split([*logs, piece])
     at = names(parts["train"]).index("piece")
-    left = {"train": np.ones(5), "validation": np.ones(2)}
+    left = {"train": np.ones(5), "validation": np.ones(2), "test": np.ones(2)}
     left["train"][[at, at - 1, at - 2]] = 40.0
     again = dealt_anew(parts, left)
     assert "piece" in names(again["train"])

@@ -10,7 +10,7 @@ from __future__ import annotations
 __all__ = ["Round", "bent", "compare", "explanations"]
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -210,19 +210,32 @@ def _priced(fit: Fit, misfit: float) -> float:
 
 
 def _fittest(fits: Sequence[Fit], most: int, alike: int = 2) -> list[Fit]:
-    """Return the best fits, so many of every set of effects at most; half of them of the fewest."""
+    """Return the best fits, so many of every set of effects at most; half of them of the fewest.
+
+    The plainest of a set, with the fewest strengths, counts apart: the best beside the same effects
+    at further places could not say that those are not needed.
+    """
     order = sorted(fits, key=lambda f: _priced(f, f.misfit))
     fewest = min(len(_names(fit)) for fit in fits)
-    half = _apart([fit for fit in order if len(_names(fit)) == fewest], most // 2, alike)
-    chosen = _apart([*half, *(fit for fit in order if fit not in half)], most, alike)
-    return sorted(chosen, key=order.index)
+    plainest: dict[frozenset[str], int] = {}
+    for fit in fits:
+        names = _names(fit)
+        plainest[names] = min(plainest.get(names, len(fit.units)), len(fit.units))
+    kinds = {id(f): (_names(f), len(f.units) == plainest[_names(f)]) for f in fits}
+    half = _apart(
+        [fit for fit in order if len(_names(fit)) == fewest], most // 2, alike, kinds=kinds
+    )
+    rest = [fit for fit in order if fit not in half]
+    return sorted(_apart([*half, *rest], most, alike, kinds=kinds), key=order.index)
 
 
-def _apart(fits: Sequence[Fit], most: int, alike: int) -> list[Fit]:
-    """Return the first fits, of every set of units one and of every set of effects so many."""
+def _apart(
+    fits: Sequence[Fit], most: int, alike: int, *, kinds: Mapping[int, Hashable]
+) -> list[Fit]:
+    """Return the first fits, of every set of units one and of every kind so many."""
     kept: list[Fit] = []
     for fit in fits:
-        same = sum(_names(fit) == _names(other) for other in kept)
+        same = sum(kinds[id(fit)] == kinds[id(other)] for other in kept)
         if len(kept) < most and same < alike and all(set(fit.units) != set(f.units) for f in kept):
             kept.append(fit)
     return kept

@@ -173,14 +173,12 @@ class Started:
 def _by_log(
     parts: Mapping[str, Sequence[Log]], nominal: Fit, sets: Mapping[str, Objective]
 ) -> dict[str, Array]:
-    """Return the mean squared innovation of each training and validation log, of every segment.
-
-    Zero for a log that has none.
-    """
-    left = {"train": nominal.innovations, "validation": sets["validation"]([nominal.point])[0]}
+    """Return the mean squared innovation of each log, of every segment; 0 if it has none."""
     found = {}
-    for name, innovations in left.items():
-        of, count = sets[name].segments.log, len(parts[name])
+    for name, objective in sets.items():
+        train = name == "train"
+        innovations = nominal.innovations if train else objective([nominal.point])[0]
+        of, count = objective.segments.log, len(parts[name])
         plain = innovations / sets[name].whitening.weights[:, None]
         total = np.bincount(of, (plain**2).mean(-1), minlength=count)
         found[name] = total / np.maximum(np.bincount(of, minlength=count), 1)

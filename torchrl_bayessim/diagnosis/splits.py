@@ -23,8 +23,10 @@ _PIECE = 0.25  # of the median log's length, below which it is a piece of one
 _AS_LONG = 1.25  # ratio of two lengths that count as one
 _APART = 3  # runs from which each split has one of its own
 _DEAL = "train", "test", "validation", "train", "train", "test", "validation", "train"
-_AGAIN = "train", "validation", "train"
+# where little shows what is missing, it is to be found before it can be tested
+_AGAIN = "train", "validation", "test", "train", "train", "validation", "test", "train"
 _SHOWS = 1.5  # mean squared innovation of a log in which something is missing
+_FAR = 1.5  # times what is missing in any log that trains
 
 
 def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
@@ -35,12 +37,11 @@ def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
     motion only should act in each split. Pieces that are much shorter than the others train: over
     them no error grows. Fewer than three logs are each divided in time: half, a quarter, a quarter.
     """
-    parts: dict[str, list[Log]] = {"train": [], "validation": [], "test": []}
     whole, pieces = _whole(logs)
     if len(whole) >= _APART:
-        for log, name in zip(_ordered(whole), cycle(_DEAL), strict=False):
-            parts[name].append(log)
+        parts = _dealt(_ordered(whole))
     else:
+        parts = _dealt([])
         for log in whole:
             ends = 0, len(log) // 2, 3 * len(log) // 4, len(log)
             for name, (begin, end) in zip(parts, pairwise(ends), strict=True):
@@ -86,29 +87,42 @@ def few(logs: Sequence[Log]) -> bool:
 def dealt_anew(
     parts: Mapping[str, list[Log]], left: Mapping[str, Array]
 ) -> Mapping[str, list[Log]]:
-    """Return the same with training and validation logs exchanged, where that is called for.
+    """Return the logs dealt by how much is missing in each, where that is called for.
 
-    Where what is missing shows in two logs or more, as friction that matters only in the widest
-    motion, and all of them are in one of the two splits, the other cannot judge what explains them.
-    Then both are dealt anew, from the log in which most is missing to the least; pieces of logs
-    train, as ever, and test logs stay.
+    What is missing may show in a few logs only, as friction that matters only in the widest motion.
+    If none of them is in a split, that split can neither teach nor judge what explains them; and if
+    far more is missing in a log than in any of those that train, no fit has seen the like. Then all
+    are dealt anew, from the log in which most is missing to the least; pieces of logs train, as
+    ever. No effect has been looked for when this is decided.
 
     Args:
         parts: The logs of each split.
-        left: Mean squared innovations with parameters alone, of each log of the two splits.
+        left: Mean squared innovations with parameters alone, of each log of each split.
     """
-    shows = {name: int((left[name] > _SHOWS).sum()) for name in ("train", "validation")}
-    if min(shows.values()) or max(shows.values()) < 2:
+    if not _lopsided(left):
         return parts
-    every = np.concatenate([left["train"], left["validation"]])
-    logs = [*parts["train"], *parts["validation"]]
-    pieces = _whole([log for part in parts.values() for log in part])[1]
-    again: dict[str, list[Log]] = {"train": [], "validation": []}
+    names = list(parts)
+    every = np.concatenate([left[name] for name in names])
+    logs = [log for name in names for log in parts[name]]
+    pieces = _whole(logs)[1]
     order = [logs[at] for at in np.argsort(-every, kind="stable")]
     whole = [log for log in order if not any(log is piece for piece in pieces)]
-    for log, name in zip(whole, cycle(_AGAIN), strict=False):
-        again[name].append(log)
-    if not again["validation"]:
-        return parts
+    again = _dealt(whole, _AGAIN)
     again["train"] += [log for log in order if any(log is piece for piece in pieces)]
-    return {**parts, **again}
+    return again
+
+
+def _dealt(logs: Sequence[Log], names: Sequence[str] = _DEAL) -> dict[str, list[Log]]:
+    """Return the logs in the splits that they are dealt to, in order."""
+    parts: dict[str, list[Log]] = {"train": [], "validation": [], "test": []}
+    for log, name in zip(logs, cycle(names), strict=False):
+        parts[name].append(log)
+    return parts
+
+
+def _lopsided(left: Mapping[str, Array]) -> bool:
+    """Return whether what shows in several logs is not in each split, or hardly in training."""
+    if sum(int((errors > _SHOWS).sum()) for errors in left.values()) < 2:
+        return False
+    most = {name: float(errors.max(initial=1.0)) - 1.0 for name, errors in left.items()}
+    return min(most.values()) < _SHOWS - 1.0 or max(most.values()) > _FAR * most["train"]
