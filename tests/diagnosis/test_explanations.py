@@ -1,0 +1,22 @@
+"""Which fits the search goes on with."""
+
+from plain_models import A, B, C, plain
+
+from torchrl_bayessim.diagnosis.explanations import _fittest
+
+
+def fit(misfit, *units):
+    return plain(units, misfit).fit
+
+
+def test_an_effect_at_one_place_stays_beside_the_same_at_several_that_fits_a_little_better():
+    at_one, at_both, other = fit(400.0, A), fit(200.0, A, B), fit(900.0, C)
+    assert _fittest([at_both, at_one, other], 3, alike=1) == [at_both, at_one, other]
+    pair, at_both_with_other = fit(250.0, A, C), fit(300.0, A, B, C)
+    assert at_both_with_other not in _fittest([at_both_with_other, pair, other], 2, alike=1)
+
+
+def test_of_one_kind_only_so_many_go_on():
+    fits = [fit(100.0 + i, unit) for i, unit in enumerate((A, B))]
+    assert _fittest(fits, 4, alike=1) == fits[:1]
+    assert _fittest(fits, 4, alike=2) == fits
