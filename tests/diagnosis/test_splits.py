@@ -42,7 +42,8 @@ def test_what_shows_in_two_training_runs_alone_is_dealt_to_all_splits():
     assert {name: len(logs) for name, logs in again.items()} == {
         "train": 4, "validation": 2, "test": 2,
     }  # fmt: skip
-    assert sorted(sum(map(names, again.values()), [])) == sorted(names(rides()))
+    dealt = [name for logs in again.values() for name in names(logs)]
+    assert sorted(dealt) == sorted(names(rides()))
 
 
 def test_the_run_in_which_far_more_is_missing_than_in_any_other_trains():

@@ -179,7 +179,7 @@ def _by_log(
         train = name == "train"
         innovations = nominal.innovations if train else objective([nominal.point])[0]
         of, count = objective.segments.log, len(parts[name])
-        plain = innovations / sets[name].whitening.weights[:, None]
+        plain = innovations / objective.whitening.weights[:, None]
         total = np.bincount(of, (plain**2).mean(-1), minlength=count)
         found[name] = total / np.maximum(np.bincount(of, minlength=count), 1)
     return found
