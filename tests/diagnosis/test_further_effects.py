@@ -7,7 +7,7 @@ import pytest
 from plain_models import A, C, Unit, plain
 
 from torchrl_bayessim.diagnosis import further_effects
-from torchrl_bayessim.diagnosis.further_effects import identified
+from torchrl_bayessim.diagnosis.further_effects import identified, stands_apart
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ SENSOR = at("sensor_gain", "hip", "scale", channel="sensing")
 
 @pytest.mark.parametrize(
     ("mine", "other", "added"),
-    [(400.0, 230.0, True), (400.0, 300.0, False), (90.0, 0.0, False)],
+    [(400.0, 230.0, True), (400.0, 300.0, False), (35.0, 0.0, False)],
     ids=["plain", "a rival is near", "faint"],
 )
 def test_what_no_law_at_the_same_joint_could_be_is_an_effect_elsewhere(mine, other, added):
@@ -175,6 +175,41 @@ def test_what_is_at_the_same_joint_may_be_the_form_of_its_law():
 
 
 def test_a_gain_that_other_runs_do_not_show_is_no_effect_elsewhere():
-    base, better = plain([FRICTION], 590.0), plain([FRICTION, SENSOR], 540.0)
+    base, better = plain([FRICTION], 590.0), plain([FRICTION, SENSOR], 575.0)
     seen, _ = screened({SENSOR: 400.0})
     assert not further_effects._elsewhere(base, better, seen, "robot")
+
+
+@pytest.mark.parametrize(("mine", "added"), [(60.0, True), (30.0, False)], ids=["plain", "faint"])
+def test_what_shows_elsewhere_is_an_effect_although_noise_alone_seems_left(mine, added):
+    """A pole's friction beside a sensor's gain, of which it leaves a hundredth."""
+    start, base = plain([], 1e6), plain([FRICTION], 440.0)
+    better = plain([FRICTION, SENSOR], 390.0)
+    seen, _ = screened({SENSOR: mine, SPRING: 900.0})
+    assert further_effects.nothing_left(start, base)
+    assert stands_apart(base, seen, "robot") == added
+    assert not identified(start, base, better, [better])
+    assert identified(start, base, better, [better], seen=seen, robot="robot") == added
+
+
+@pytest.mark.parametrize(("timestep", "added"), [(0.5, True), (2.0, False)])
+def test_where_noise_seems_left_a_delay_is_longer_than_a_time_step(timestep, added):
+    class Late(Placed):
+        def actual(self, strength):
+            return strength
+
+    late = Late("action_delay", "hip", at("action_delay", "hip", "timing").effect)
+    start, base, better = (
+        plain(units, left)
+        for units, left in (([], 1e6), ([FRICTION], 440.0), ([FRICTION, late], 390.0))
+    )
+    seen, _ = screened({late: 60.0, SPRING: 900.0})
+    given = start, base, better, [better]
+    assert identified(*given, timestep=timestep, seen=seen, robot="robot") == added
+
+
+def test_two_kinds_that_show_elsewhere_alike_stand_not_apart():
+    base = plain([FRICTION], 440.0)
+    both = {SENSOR: 60.0, at("gain", "hip"): 50.0}
+    assert not stands_apart(base, screened(both)[0], "robot")
+    assert not stands_apart(base, screened({SPRING: 900.0})[0], "robot")

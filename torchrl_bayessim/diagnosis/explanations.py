@@ -52,17 +52,15 @@ class Round:
     index: NDArray[np.int64]
 
 
-def compare(train: Objective, base: Fit, units: Sequence[Unit], *, glance: bool = False) -> Round:
+def compare(train: Objective, base: Fit, units: Sequence[Unit]) -> Round:
     """Screen units on some segments, then what may matter on all.
 
     Args:
         train: The segments.
         base: What is in the model already.
         units: What may be missing.
-        glance: Look at fewer segments, and at nothing on all; as where the gap is large.
     """
-    coarser = 2 if glance else 1
-    every = int(np.clip(round(coarser * len(train.segments) / _FEW), 1, coarser * _EVERY))
+    every = int(np.clip(round(len(train.segments) / _FEW), 1, _EVERY))
     index = base.spread(every)
     thin, fit = train.take(index), base.take(index)
     if len(units) > _MANY:  # single ones only of the effects that matter
@@ -73,7 +71,7 @@ def compare(train: Objective, base: Fit, units: Sequence[Unit], *, glance: bool 
         names = list(dict.fromkeys(unit.name for unit in best))[:_MATTER]
         units = [u for u in units if u in whole or u.name in names]
     coarse = screen(thin, fit, units)
-    if glance or every == 1 or _plain(fit):
+    if every == 1 or _plain(fit):
         return Round(base, coarse.grown(every), thin, coarse, index)
     first = list(coarse.best(1.0))[:_MATTER]
     together = [unit for on in [*pairs(coarse), *groups(coarse)] for unit in on]

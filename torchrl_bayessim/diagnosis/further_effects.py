@@ -8,10 +8,10 @@ under another name, and stands beside it as its rival.
 
 from __future__ import annotations
 
-__all__ = ["identified", "nothing_left"]
+__all__ = ["identified", "nothing_left", "stands_apart"]
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -31,8 +31,8 @@ _VISIBLE = 1.2  # mean squared innovation that shows however small a share of th
 _DELAYS = ActionDelay.name, SensorDelay.name
 _WRONG = 1.5  # mean squared innovation of a base that something is missing from
 _SURELY, _NOTHING = 50.0, 0.2  # gain, and share of what the base leaves: it was just this
-# likelihood ratio of what is plain elsewhere, and times that of what another kind has there
-_PLAIN, _FAR = 100.0, 1.5
+# likelihood ratio of what is plain elsewhere, times that of what another kind has there, and gain
+_PLAIN, _FAR, _SHOWN = 40.0, 1.5, 10.0
 _DIFFERENT = 0.1  # of the change that an effect makes: what another makes differently
 
 
@@ -59,11 +59,12 @@ def identified(
     """
     if not base.units:
         return True
-    if nothing_left(start, base):
-        return False
-    if _matters(start, base, better, models, timestep=timestep):
+    left = not nothing_left(start, base)
+    if left and _matters(start, base, better, models, timestep=timestep):
         return True
-    return seen is not None and robot is not None and _elsewhere(base, better, seen, robot)
+    if seen is None or robot is None or not _elsewhere(base, better, seen, robot):
+        return False
+    return left or ActionDelay.group not in _added(base, better) or _later(base, better, timestep)
 
 
 def _matters(
@@ -95,6 +96,13 @@ def _matters(
     return (before > _WRONG or just_this) and not _rivalled(base, better, models)
 
 
+def stands_apart(base: Model, seen: Screen, robot: Robot) -> bool:
+    """Return whether an effect shows elsewhere, however little of the gap is left to it."""
+    told = _told(base, seen, robot)
+    unit = max(told, key=lambda unit: told[unit], default=None)
+    return unit is not None and told[unit] > _apart_from(unit.effect.group, told)
+
+
 def _elsewhere(base: Model, better: Model, seen: Screen, robot: Robot) -> bool:
     """Return whether one effect is added that no other law at the places of the base could be.
 
@@ -103,15 +111,24 @@ def _elsewhere(base: Model, better: Model, seen: Screen, robot: Robot) -> bool:
     another kind, is that effect, however little of the gap it is.
     """
     added = better.beyond(base)
-    if len({unit.name for unit in added}) != 1 or gain(base, better) < _SURELY:
+    if len({unit.name for unit in added}) != 1 or gain(base, better) < _SHOWN:
         return False
+    told = _told(base, seen, robot)
+    mine = max((told.get(unit, 0.0) for unit in added), default=0.0)
+    return mine > _apart_from(added[0].effect.group, told)
+
+
+def _told(base: Model, seen: Screen, robot: Robot) -> dict[Unit, float]:
+    """Return likelihood ratios of units beside all laws at the places of the base."""
     places = {place for unit in base.units for place in _places(unit, robot)}
     near = {unit for unit in seen.units if _places(unit, robot) <= places}
-    told = seen.beside(near, base.dispersion())
-    mine = max((told.get(unit, 0.0) for unit in added), default=0.0)
-    group = added[0].effect.group
+    return seen.beside(near, base.dispersion())
+
+
+def _apart_from(group: str, told: Mapping[Unit, float]) -> float:
+    """Return the likelihood ratio from which an effect of a group stands apart from all others."""
     others = (ratio for unit, ratio in told.items() if unit.effect.group != group)
-    return mine > max(_PLAIN, _FAR * max(others, default=0.0))
+    return max(_PLAIN, _FAR * max(others, default=0.0))
 
 
 def _places(unit: Unit, robot: Robot) -> set[tuple[str, int]]:

@@ -23,7 +23,7 @@ from .choice import chosen, fewest
 from .elimination import eliminated, without_stopgaps
 from .explanations import bent, compare, explanations
 from .form_fit import with_fitted_forms, with_forms_anew
-from .further_effects import identified, nothing_left
+from .further_effects import identified, nothing_left, stands_apart
 from .model import Model, judged
 from .objective import Objective, Point, Unit
 from .refit import Fit, refit
@@ -87,23 +87,24 @@ def select(
     """
     start = judged(train, validation, [nominal])[0]
     best, tried, screens, p_values, offered = start, [start], [], [], units
-    worth = _worth(start, train.predictor.system)
+    robot, worth = train.predictor.system.robot, _worth(start, train.predictor.system)
     for round_number in range(_MOST):
         progress(f"screening {len(units)} effects, round {round_number + 1}")
-        enough = nothing_left(start, best)
+        enough, units = nothing_left(start, best), _with_forms(units, best)
         left = [u for u in units if u not in best.units]
         if best.units and not enough:
             left = with_shapes(left, _beside(best, shapes(best.fit.point)))
-        now = compare(train, best.fit, left, glance=enough)
+        now = compare(train, best.fit, left)
         screens.append(now.seen)
         p_values.append(_p_value(now.seen, best, generator))
         if known is not None and not best.units:
             models = _anew(train, validation, known)
             best, tried = models[0], [start, *models]
-            units = _with_forms(units, best)
             continue
+        if enough and not stands_apart(best, now.seen, robot):
+            break
         # where much is left, what a first derivative does not see may still be the cause
-        if enough or (p_values[-1] > alpha and not bent(best.fit)):
+        if p_values[-1] > alpha and not bent(best.fit):
             break
         progress("fitting explanations")
         models = judged(train, validation, explanations(train, now))
@@ -113,9 +114,8 @@ def select(
         better = fewest((train, validation), best, better, models, worth=plain, offered=offered)
         if better is None or not plain(best, better, models):
             break
-        best = _exactly(train, validation, better)
-        best = with_fitted_forms(train, validation, best, offered)
-        units = _with_forms(units, best)
+        exact = _exactly(train, validation, better)
+        best = with_fitted_forms(train, validation, exact, offered)
         tried += [better, best]
     progress("taking out what is not needed")
     needs, dropped = eliminated(train, validation, best)

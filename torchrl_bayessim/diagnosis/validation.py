@@ -24,7 +24,7 @@ NAMED = 0.8  # share of the gap that a cause without reserve explains
 NEGLIGIBLE = 1.05  # mean squared innovation: an excess over noise that no one would chase
 SHOWN = 1.2  # mean squared innovation of runs that show a gap
 SURE = 1e-5  # p-value of a gap that is there
-_LARGELY = 0.6  # share of such a gap that is enough
+_LARGELY = 0.5  # share of such a gap that is enough
 _GONE = 50.0  # squares that are surely not of chance
 
 
