@@ -11,13 +11,19 @@ from torchrl_bayessim.diagnosis.refit import Fit
 
 
 class Unit(NamedTuple):
+    """An effect at one joint, whose number is that of its place."""
+
     name: str
     where: str = "hip"
     high: float = 1.0
+    direction: tuple[float, ...] = (1.0,)
 
     @property
     def effect(self):
-        return SimpleNamespace(group=self.name, placed=())
+        joint = ["hip", "knee", "x", "y"].index(self.where)
+        return SimpleNamespace(
+            group=self.name, placed=(), channel="body", joint=lambda robot, target: joint
+        )
 
 
 A, B, C = Unit("gain", "knee"), Unit("gain", "hip"), Unit("friction", "hip")

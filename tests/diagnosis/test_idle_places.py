@@ -1,6 +1,7 @@
 """Places of an effect, and effects, that a model has for nothing."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,15 +29,26 @@ def test_an_effect_of_its_own_is_not_idle():
 
 
 @pytest.mark.parametrize(
-    ("without", "kept"),
-    [(510.0, {"gain"}), (900.0, {"gain", "friction"})],
+    ("without", "with_it", "where", "kept"),
+    [
+        (510.0, 500.0, "hip", {"gain"}),
+        (900.0, 500.0, "hip", {"gain", "friction"}),
+        (500.0, 420.0, "hip", {"gain", "friction"}),
+        (500.0, 420.0, "knee", {"gain"}),
+        (450.0, 420.0, "hip", {"gain"}),
+    ],
+    ids=["idle", "most of the rest", "surely elsewhere", "at the same joint", "faint"],
 )
-def test_an_effect_with_next_to_no_credit_is_not_named(without, kept):
-    start, best = plain([], 1e6), plain([A, C], 500.0)
+def test_an_effect_with_next_to_no_credit_is_named_only_if_nothing_else_can_be_it(
+    without, with_it, where, kept
+):
+    friction = Unit("friction", where)
+    start, best = plain([], 1e6), plain([A, friction], with_it)
     others = {"friction": (plain([A, Unit("drag", "hip")], 600.0),)}
-    tried = (start, plain([A], without), plain([C], 1e6))
+    tried = (start, plain([A], without), plain([friction], 1e6))
     selection = Selection(start, best, (), (0.0,), tried, others)
-    left = worthwhile(selection, {})
+    predictor = SimpleNamespace(system=SimpleNamespace(robot="robot"))
+    left = worthwhile(selection, {"train": SimpleNamespace(predictor=predictor)})
     assert {one.name for one in left.best.units} == kept
     assert set(left.alternatives) == kept & set(others)
 

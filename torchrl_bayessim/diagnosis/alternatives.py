@@ -8,7 +8,7 @@ from __future__ import annotations
 
 __all__ = ["alternatives", "exchanged", "kind", "leaves_less_to_do"]
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from ..effects.effect import Effect
 from ..effects.joints import CoulombFriction
 from ..effects.transmission import ServoDeadBand
 from .explanations import compare
+from .form_fit import bendable, fitted_numbers, with_fitted_forms
 from .model import LIKELY, Model, as_good, criterion, gain, judged, needed, numbers
 from .objective import Objective, Point, Unit
 from .refit import WIDE, refit
@@ -24,6 +25,7 @@ from .screening import Screen
 
 _ALIKE = 4  # models with an effect of the same group in its place
 _RIVALS = 6  # models with another effect in the place of one
+_LAWS = 2  # of those that bend
 _MORE, _LITTLE = 5.0, 0.05  # mean squared innovation; share of friction's range, to start from
 _SMALLER = 0.75  # times: all strengths of an equal that is plainer
 _LESS = 0.5  # times: of what an effect did that made up for another
@@ -38,8 +40,19 @@ def alternatives(
     units: Sequence[Unit],
     tried: Sequence[Model],
     first: Screen,
+    offered: Collection[Unit],
 ) -> dict[str, tuple[Model, ...]]:
-    """Return models with another effect in the place of each effect of the best one."""
+    """Return models with another effect in the place of each effect of the best one.
+
+    Args:
+        train: Where models are fitted.
+        validation: Where they are judged.
+        best: Whose effects are replaced.
+        units: The effects to consider.
+        tried: Every model that was fitted, the first with parameters alone.
+        first: All units, compared with that one.
+        offered: The effects as they were offered, of which no number has been fitted.
+    """
     start = tried[0]
     result: dict[str, tuple[Model, ...]] = {}
     names = list(dict.fromkeys(unit.name for unit in best.units))
@@ -65,6 +78,7 @@ def alternatives(
                 additions.setdefault(unit.effect, {unit: strength})
         known += _raced((train, validation), _with_each(base, additions.values()), best)
         known += _as_before((train, validation), best, name, tried)
+        known += _bent((train, validation), best, known, offered)
         known += _sliding((train, validation), best, kept, units)
         known += _sticking((train, validation), best, name, units)
         if train.width > Objective.width:
@@ -94,6 +108,29 @@ def _as_before(
         if as_good(alone[0], m)
     }
     return _raced(sets, list(starts.values()), best)
+
+
+def _bent(
+    sets: tuple[Objective, Objective],
+    best: Model,
+    known: Sequence[Model],
+    offered: Collection[Unit],
+) -> list[Model]:
+    """Return laws that bend to the data, with no more numbers than the effect that they replace.
+
+    A payload that is held aside moves the centre of mass in two directions.
+    """
+    train, most = sets[0], fitted_numbers(sets[0], best, offered)
+    kinds: dict[str, Model] = {}
+    for model in sorted(known, key=lambda m: criterion(m, 1.0)):
+        added = model.beyond(best)
+        fewer = fitted_numbers(train, model, offered) < most
+        if added and fewer and bendable(train, added) and not as_good(best, model):
+            kinds.setdefault(added[0].name, model)
+    plain = list(kinds.values())[:_LAWS]
+    fitted = [with_fitted_forms(*sets, model, offered) for model in plain]
+    fitted = [bent for bent in fitted if bent not in plain]
+    return [bent for bent in fitted if fitted_numbers(train, bent, offered) <= most]
 
 
 def _names(model: Model) -> set[str]:

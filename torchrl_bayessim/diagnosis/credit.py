@@ -12,6 +12,7 @@ from math import factorial
 import numpy as np
 
 from .elimination import parts
+from .further_effects import surely_elsewhere
 from .objective import Objective, Unit
 from .selection import Selection
 
@@ -23,7 +24,7 @@ def worthwhile(selection: Selection, sets: Mapping[str, Objective]) -> Selection
     """Return the selection, apart, without effects that have next to no credit.
 
     In a model that is a little off everywhere a further effect mends some of it, surely but for
-    nothing.
+    nothing; unless it is what no law at the places of the others could be.
     """
     while True:
         selection = _apart(selection, sets)
@@ -36,6 +37,8 @@ def worthwhile(selection: Selection, sets: Mapping[str, Objective]) -> Selection
         best = min(without, key=lambda model: float(model.deviances().sum()))
         if best.deviances().sum() > _MORE * selection.best.deviances().sum():
             return selection  # little of the gap, but most of what is left of it
+        if surely_elsewhere(best, selection.best, sets["train"].predictor.system.robot):
+            return selection
         others = {n: models for n, models in selection.alternatives.items() if n != least}
         selection = replace(selection, best=best, alternatives=others)
 

@@ -8,7 +8,7 @@ under another name, and stands beside it as its rival.
 
 from __future__ import annotations
 
-__all__ = ["identified", "nothing_left", "stands_apart"]
+__all__ = ["identified", "nothing_left", "stands_apart", "surely_elsewhere"]
 
 import math
 from collections.abc import Mapping, Sequence
@@ -118,9 +118,20 @@ def _elsewhere(base: Model, better: Model, seen: Screen, robot: Robot) -> bool:
     return mine > _apart_from(added[0].effect.group, told)
 
 
+def surely_elsewhere(base: Model, better: Model, robot: Robot) -> bool:
+    """Return whether what a model has beside a base is at another place, and surely needed.
+
+    The model has to leave noise alone: one that is off everywhere needs whatever mends some of it.
+    """
+    lost = float((base.deviances() - better.deviances()).sum()) / better.dispersion()
+    places = _places_of(base, robot)
+    apart = any(not _places(unit, robot) <= places for unit in better.beyond(base))
+    return apart and lost > _PLAIN and better.mean_square < _VISIBLE
+
+
 def _told(base: Model, seen: Screen, robot: Robot) -> dict[Unit, float]:
     """Return likelihood ratios of units beside all laws at the places of the base."""
-    places = {place for unit in base.units for place in _places(unit, robot)}
+    places = _places_of(base, robot)
     near = {unit for unit in seen.units if _places(unit, robot) <= places}
     return seen.beside(near, base.dispersion())
 
@@ -129,6 +140,10 @@ def _apart_from(group: str, told: Mapping[Unit, float]) -> float:
     """Return the likelihood ratio from which an effect of a group stands apart from all others."""
     others = (ratio for unit, ratio in told.items() if unit.effect.group != group)
     return max(_PLAIN, _FAR * max(others, default=0.0))
+
+
+def _places_of(model: Model, robot: Robot) -> set[tuple[str, int]]:
+    return {place for unit in model.units for place in _places(unit, robot)}
 
 
 def _places(unit: Unit, robot: Robot) -> set[tuple[str, int]]:

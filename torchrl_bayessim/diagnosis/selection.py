@@ -122,12 +122,13 @@ def select(
     if len(needs.units) < len(best.units):
         needs = with_forms_anew(train, validation, needs, offered)
     needs = without_stopgaps(train, validation, needs, offered)
-    units = _with_forms(units, needs)
     tried += [*dropped, needs]
-    best, others = _settled(
-        train, validation, needs, units=units, tried=tried, first=screens[0], progress=progress
-    )
-    found = start, best, tuple(screens), tuple(p_values), tuple(tried), others
+    instead = partial(
+        alternatives, train, validation,
+        units=_with_forms(units, needs), first=screens[0], offered=offered,
+    )  # fmt: skip
+    settled = _settled(train, validation, needs, instead, tried=tried, progress=progress)
+    found = start, settled[0], tuple(screens), tuple(p_values), tuple(tried), settled[1]
     return Selection(*found, offered=tuple(offered))
 
 
@@ -151,10 +152,9 @@ def _settled(
     train: Objective,
     validation: Objective,
     best: Model,
+    instead: Callable[..., dict[str, tuple[Model, ...]]],
     *,
-    units: Sequence[Unit],
     tried: list[Model],
-    first: Screen,
     progress: Callable[[str], None],
 ) -> tuple[Model, dict[str, tuple[Model, ...]]]:
     """Return the best model, after exchanges, and the models with others instead."""
@@ -162,7 +162,7 @@ def _settled(
         if not best.units:
             break
         progress("trying others in its place")
-        others = alternatives(train, validation, best, units=units, tried=tried, first=first)
+        others = instead(best, tried=tried)
         tried += [model for models in others.values() for model in models]
         better = exchanged(best, others)
         if better is best or exchanges == _EXCHANGES:
