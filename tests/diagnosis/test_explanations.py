@@ -20,3 +20,8 @@ def test_of_one_kind_only_so_many_go_on():
     fits = [fit(100.0 + i, unit) for i, unit in enumerate((A, B))]
     assert _fittest(fits, 4, alike=1) == fits[:1]
     assert _fittest(fits, 4, alike=2) == fits
+
+
+def test_the_same_effect_elsewhere_is_added_like_any_other():
+    elsewhere, other, two = fit(300.0, A, B), fit(200.0, A, C), fit(100.0, A, B, C)
+    assert _fittest([elsewhere, other, two], 2, there=[A], alike=1) == [two, other]

@@ -10,7 +10,7 @@ from __future__ import annotations
 __all__ = ["Round", "bent", "compare", "explanations"]
 
 from collections import Counter
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,14 +97,14 @@ def explanations(train: Objective, now: Round) -> list[Fit]:
     tried = refit(now.thin, starts, origins=tried, iterations=3, renew=False)
     everywhere = [
         point
-        for fit in _fittest(tried, _SURVIVORS)
+        for fit in _fittest(tried, _SURVIVORS, there=base.units)
         for point in _spread(fit, train.predictor.system.robot)
     ]
     tried += refit(now.thin, everywhere, iterations=3, renew=False)
     if _plain(base.take(now.index)):
-        best = _fittest(tried, _FINALISTS, alike=1)
+        best = _fittest(tried, _FINALISTS, there=base.units, alike=1)
         return refit(train, [fit.point for fit in best], race=np.inf)
-    starts = [fit.point for fit in _fittest(tried, _SURVIVORS)]
+    starts = [fit.point for fit in _fittest(tried, _SURVIVORS, there=base.units)]
     known: list[Fit | None] = []
     for point in starts:
         on = [unit for unit in point.strengths if unit not in base.units]
@@ -112,7 +112,7 @@ def explanations(train: Objective, now: Round) -> list[Fit]:
         near &= set(base.units) <= set(point.strengths)  # unless spread over their targets
         known.append(now.seen.origin(base, on) if near else None)
     tried = refit(train, starts, origins=known, iterations=2, renew=False)
-    best = _fittest(tried, _FINALISTS, alike=1)
+    best = _fittest(tried, _FINALISTS, there=base.units, alike=1)
     return refit(train, [fit.point for fit in best], origins=best, race=np.inf)
 
 
@@ -207,22 +207,29 @@ def _priced(fit: Fit, misfit: float) -> float:
     return misfit * (1 + 4.0 * len(fit.units) / fit.innovations.size) + 4.0 * len(fit.units)
 
 
-def _fittest(fits: Sequence[Fit], most: int, alike: int = 2) -> list[Fit]:
-    """Return the best fits, so many of every set of effects at most; half of them of the fewest.
+def _fittest(
+    fits: Sequence[Fit], most: int, *, there: Collection[Unit] = (), alike: int = 2
+) -> list[Fit]:
+    """Return the best fits, so many of every set of effects at most; half of them add the fewest.
 
     The plainest of a set, with the fewest strengths, counts apart: the best beside the same effects
     at further places could not say that those are not needed.
+
+    Args:
+        fits: To choose from.
+        most: How many.
+        there: What is in the model already; the same effect elsewhere is added like any other.
+        alike: How many of a set.
     """
     order = sorted(fits, key=lambda f: _priced(f, f.misfit))
-    fewest = min(len(_names(fit)) for fit in fits)
+    added = {id(fit): len({u.name for u in fit.units if u not in there}) for fit in fits}
+    fewest = min(added.values())
     plainest: dict[frozenset[str], int] = {}
     for fit in fits:
         names = _names(fit)
         plainest[names] = min(plainest.get(names, len(fit.units)), len(fit.units))
     kinds = {id(f): (_names(f), len(f.units) == plainest[_names(f)]) for f in fits}
-    half = _apart(
-        [fit for fit in order if len(_names(fit)) == fewest], most // 2, alike, kinds=kinds
-    )
+    half = _apart([fit for fit in order if added[id(fit)] == fewest], most // 2, alike, kinds=kinds)
     rest = [fit for fit in order if fit not in half]
     return sorted(_apart([*half, *rest], most, alike, kinds=kinds), key=order.index)
 
