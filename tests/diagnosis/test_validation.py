@@ -33,12 +33,18 @@ def test_the_share_is_of_what_is_above_the_floor(before, after, values, share):
 
 
 @pytest.mark.parametrize(
-    ("refit", "interval", "hardly"),
-    [(1.1, (0.0, 0.1), True), (5.0, (-0.5, 0.9), True), (5.0, (0.1, 0.5), False)],
+    ("refit", "interval", "validated", "hardly"),
+    [
+        (1.1, (0.0, 0.1), 0.9, True),
+        (5.0, (-0.5, 0.9), 1.0, True),
+        (5.0, (0.1, 0.5), 0.9, False),
+        (1.3, (-0.2, 0.7), 0.6, True),
+        (1.3, (-0.2, 0.7), 0.75, False),
+    ],
 )
-def test_test_runs_that_exclude_most_of_the_gap_say_so(refit, interval, hardly):
+def test_test_runs_that_exclude_what_validation_runs_say_say_so(refit, interval, validated, hardly):
     measured = Shrinkage(9.0, refit, 1.0, 0.05, interval, (0.0, 9.0), (0.0, 1.0))
-    assert hardly_shown(measured) is hardly
+    assert hardly_shown(measured, validated) is hardly
 
 
 def test_a_doubtful_gap_needs_a_larger_share():

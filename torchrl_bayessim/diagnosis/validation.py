@@ -33,9 +33,12 @@ def enough(p_value: float) -> float:
     return _LARGELY if p_value < SURE else NAMED
 
 
-def hardly_shown(measured: Shrinkage) -> bool:
-    """Return whether test runs show so little of the gap that they cannot say what explains it."""
-    return measured.refit < SHOWN or measured.explained_ci[1] >= NAMED
+def hardly_shown(measured: Shrinkage, validated: float) -> bool:
+    """Return whether test runs show so little of the gap that they cannot say what explains it.
+
+    Either there is hardly any, or they let the effects explain as much as validation runs say.
+    """
+    return measured.refit < SHOWN or measured.explained_ci[1] >= min(validated, NAMED)
 
 
 def share_on_validation(selection: Selection) -> float:

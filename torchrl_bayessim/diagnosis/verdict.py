@@ -171,7 +171,7 @@ class _Weighed:
         perhaps_nothing = measured.explained_ci[0] <= 0 and validated < PARTIAL and not by_chance
         unsaid = measured.explained < PARTIAL or perhaps_nothing
         contradicted = measured.effects > SHOWN * measured.refit  # by what test runs do show
-        elsewhere = unsaid and hardly_shown(measured) and validated >= enough(p_value)
+        elsewhere = unsaid and hardly_shown(measured, validated) and validated >= enough(p_value)
         elsewhere &= not contradicted
         helps = certain and measured.p_value < alpha and measured.explained_ci[1] >= PARTIAL
         helps &= measured.effects <= _NOISE_AGAIN
