@@ -31,19 +31,17 @@ def test_what_was_as_good_alone_is_tried_beside_the_others_from_its_own_paramete
 
 
 @pytest.mark.parametrize(
-    ("places", "most", "count"), [(2, 2, 1), (1, 2, 0), (2, 3, 0)],
-    ids=["as many numbers", "more than it replaces", "still more once bent"],
+    ("places", "numbers", "count"), [(2, 2, 1), (1, 1, 0), (2, 3, 0)],
+    ids=["as many numbers", "at one place", "more numbers once bent"],
 )  # fmt: skip
 def test_a_law_that_bends_is_tried_in_the_place_of_an_effect_with_as_many_numbers(
-    monkeypatch, places, most, count
+    monkeypatch, places, numbers, count
 ):
     """A payload held aside, whose second number says where, and a centre of mass in one or two."""
     shift = [Unit("com_shift", where) for where in ("x", "y")[:places]]
     best, aside = plain(shift, 300.0), plain([PAYLOAD], 305.0)
-    numbers = {aside: most}
-    monkeypatch.setattr(
-        alternatives, "fitted_numbers", lambda _, model, __: numbers.get(model, len(model.units))
-    )
+    known_numbers = {best: places, aside: numbers}
+    monkeypatch.setattr(alternatives, "fitted_numbers", lambda _, model, __: known_numbers[model])
     monkeypatch.setattr(alternatives, "bendable", lambda _, units: PAYLOAD in units)
     monkeypatch.setattr(alternatives, "with_fitted_forms", lambda *_: aside)
     known = [plain([PAYLOAD], 9000.0), plain([PAYLOAD], 8000.0), plain([DRAG], 7000.0)]

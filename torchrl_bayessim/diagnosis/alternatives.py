@@ -116,15 +116,14 @@ def _bent(
     known: Sequence[Model],
     offered: Collection[Unit],
 ) -> list[Model]:
-    """Return laws that bend to the data, with no more numbers than the effect that they replace.
+    """Return laws that bend to the data, in the place of an effect at several places.
 
-    A payload that is held aside moves the centre of mass in two directions.
+    With no more numbers: a payload that is held aside moves the centre of mass in two directions.
     """
     train, most = sets[0], fitted_numbers(sets[0], best, offered)
     kinds: dict[str, Model] = {}
     for model in sorted(known, key=lambda m: criterion(m, 1.0)):
-        added = model.beyond(best)
-        fewer = fitted_numbers(train, model, offered) < most
+        added, fewer = model.beyond(best), len(model.units) < len(best.units)
         if added and fewer and bendable(train, added) and not as_good(best, model):
             kinds.setdefault(added[0].name, model)
     plain = list(kinds.values())[:_LAWS]
