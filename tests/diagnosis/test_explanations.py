@@ -11,9 +11,12 @@ def fit(misfit, *units):
 
 def test_an_effect_at_one_place_stays_beside_the_same_at_several_that_fits_a_little_better():
     at_one, at_both, other = fit(400.0, A), fit(200.0, A, B), fit(900.0, C)
-    assert _fittest([at_both, at_one, other], 3, alike=1) == [at_both, at_one, other]
+    worse, anything = fit(500.0, B), fit(950.0, A, C)
+    fits = [at_both, at_one, worse, other, anything]
+    assert _fittest(fits, 2, alike=1) == [at_both, at_one, other]
+    assert _fittest(fits, 2, there=[C], alike=1) == [at_both, at_one, other]
     pair, at_both_with_other = fit(250.0, A, C), fit(300.0, A, B, C)
-    assert at_both_with_other not in _fittest([at_both_with_other, pair, other], 2, alike=1)
+    assert _fittest([at_both_with_other, pair, other], 2, alike=1) == [pair, other]
 
 
 def test_of_one_kind_only_so_many_go_on():
@@ -24,4 +27,6 @@ def test_of_one_kind_only_so_many_go_on():
 
 def test_the_same_effect_elsewhere_is_added_like_any_other():
     elsewhere, other, two = fit(300.0, A, B), fit(200.0, A, C), fit(100.0, A, B, C)
-    assert _fittest([elsewhere, other, two], 2, there=[A], alike=1) == [two, other]
+    fits = [elsewhere, other, two]
+    assert _fittest(fits, 2, alike=1) == [two, other, elsewhere]
+    assert _fittest(fits, 2, there=[A], alike=1) == [other, elsewhere]

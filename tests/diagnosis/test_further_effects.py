@@ -177,19 +177,25 @@ def test_what_is_at_the_same_joint_may_be_the_form_of_its_law():
 def test_a_gain_that_other_runs_do_not_show_is_no_effect_elsewhere():
     base, better = plain([FRICTION], 590.0), plain([FRICTION, SENSOR], 575.0)
     seen, _ = screened({SENSOR: 400.0})
-    assert not further_effects._elsewhere(base, better, seen, "robot")
+    assert not further_effects._elsewhere(base, better, seen, "robot", far=1.5)
 
 
-@pytest.mark.parametrize(("mine", "added"), [(60.0, True), (30.0, False)], ids=["plain", "faint"])
-def test_what_shows_elsewhere_is_an_effect_although_noise_alone_seems_left(mine, added):
+@pytest.mark.parametrize(
+    ("mine", "other", "apart"),
+    [(60.0, 15.0, True), (30.0, 0.0, False), (60.0, 30.0, False)],
+    ids=["plain", "faint", "a rival is near"],
+)
+@pytest.mark.parametrize("gap", [2e5, 2e6], ids=["a little of the gap", "as a force a little off"])
+def test_what_shows_elsewhere_is_an_effect_although_noise_alone_seems_left(gap, mine, other, apart):
     """A pole's friction beside a sensor's gain, of which it leaves a hundredth."""
-    start, base = plain([], 1e6), plain([FRICTION], 440.0)
+    start, base = plain([], gap), plain([FRICTION], 440.0)
     better = plain([FRICTION, SENSOR], 390.0)
-    seen, _ = screened({SENSOR: mine, SPRING: 900.0})
+    seen, _ = screened({SENSOR: mine, at("gain", "hip"): other, SPRING: 900.0})
     assert further_effects.nothing_left(start, base)
-    assert stands_apart(base, seen, "robot") == added
+    assert stands_apart(base, seen, "robot") == apart
     assert not identified(start, base, better, [better])
-    assert identified(start, base, better, [better], seen=seen, robot="robot") == added
+    added = identified(start, base, better, [better], seen=seen, robot="robot")
+    assert added == (apart and gap < 1e6)
 
 
 @pytest.mark.parametrize(("timestep", "added"), [(0.5, True), (2.0, False)])
@@ -201,7 +207,7 @@ def test_where_noise_seems_left_a_delay_is_longer_than_a_time_step(timestep, add
     late = Late("action_delay", "hip", at("action_delay", "hip", "timing").effect)
     start, base, better = (
         plain(units, left)
-        for units, left in (([], 1e6), ([FRICTION], 440.0), ([FRICTION, late], 390.0))
+        for units, left in (([], 2e5), ([FRICTION], 440.0), ([FRICTION, late], 390.0))
     )
     seen, _ = screened({late: 60.0, SPRING: 900.0})
     given = start, base, better, [better]

@@ -56,6 +56,8 @@ def test_the_run_in_which_far_more_is_missing_than_in_any_other_trains():
     assert names(dealt_anew(parts, shown)["train"])[0] == names(parts["test"])[1]
     shown["test"][1] = 3.9  # less than half as much again
     assert dealt_anew(parts, shown) is parts
+    plenty = {"train": shown["train"] * 40, "validation": shown["validation"] * 90}
+    assert dealt_anew(parts, {**shown, **plenty}) is parts
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from __future__ import annotations
 __all__ = ["Round", "bent", "compare", "explanations"]
 
 from collections import Counter
-from collections.abc import Collection, Hashable, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -212,35 +212,32 @@ def _fittest(
 ) -> list[Fit]:
     """Return the best fits, so many of every set of effects at most; half of them add the fewest.
 
-    The plainest of a set, with the fewest strengths, counts apart: the best beside the same effects
-    at further places could not say that those are not needed.
+    Beside them the plainest of the same sets, with the fewest strengths: the best beside the same
+    effects at further places could not say that those are not needed.
 
     Args:
         fits: To choose from.
-        most: How many.
+        most: How many, but for the plainest.
         there: What is in the model already; the same effect elsewhere is added like any other.
         alike: How many of a set.
     """
     order = sorted(fits, key=lambda f: _priced(f, f.misfit))
     added = {id(fit): len({u.name for u in fit.units if u not in there}) for fit in fits}
     fewest = min(added.values())
-    plainest: dict[frozenset[str], int] = {}
-    for fit in fits:
-        names = _names(fit)
-        plainest[names] = min(plainest.get(names, len(fit.units)), len(fit.units))
-    kinds = {id(f): (_names(f), len(f.units) == plainest[_names(f)]) for f in fits}
-    half = _apart([fit for fit in order if added[id(fit)] == fewest], most // 2, alike, kinds=kinds)
-    rest = [fit for fit in order if fit not in half]
-    return sorted(_apart([*half, *rest], most, alike, kinds=kinds), key=order.index)
+    half = _apart([fit for fit in order if added[id(fit)] == fewest], most // 2, alike)
+    chosen = _apart([*half, *(fit for fit in order if fit not in half)], most, alike)
+    for names in {_names(fit): None for fit in chosen}:
+        plainest = min((f for f in order if _names(f) == names), key=lambda f: len(f.units))
+        if all(set(fit.units) != set(plainest.units) for fit in chosen):
+            chosen.append(plainest)
+    return sorted(chosen, key=order.index)
 
 
-def _apart(
-    fits: Sequence[Fit], most: int, alike: int, *, kinds: Mapping[int, Hashable]
-) -> list[Fit]:
-    """Return the first fits, of every set of units one and of every kind so many."""
+def _apart(fits: Sequence[Fit], most: int, alike: int) -> list[Fit]:
+    """Return the first fits, of every set of units one and of every set of effects so many."""
     kept: list[Fit] = []
     for fit in fits:
-        same = sum(kinds[id(fit)] == kinds[id(other)] for other in kept)
+        same = sum(_names(fit) == _names(other) for other in kept)
         if len(kept) < most and same < alike and all(set(fit.units) != set(f.units) for f in kept):
             kept.append(fit)
     return kept

@@ -26,7 +26,7 @@ _DEAL = "train", "test", "validation", "train", "train", "test", "validation", "
 # where little shows what is missing, it is to be found before it can be tested
 _AGAIN = "train", "validation", "test", "train", "train", "validation", "test", "train"
 _SHOWS = 1.5  # mean squared innovation of a log in which something is missing
-_FAR = 1.5  # times what is missing in any log that trains
+_FAR, _PLENTY = 1.5, 10.0  # times what is missing in any log that trains; what is enough to fit
 
 
 def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
@@ -91,8 +91,8 @@ def dealt_anew(
 
     What is missing may show in a few logs only, as friction that matters only in the widest motion.
     If none of them is in a split, that split can neither teach nor judge what explains them; and if
-    far more is missing in a log than in any of those that train, no fit has seen the like. Then all
-    are dealt anew, from the log in which most is missing to the least; pieces of logs train, as
+    little is missing in those that train, and far more in another, no fit has seen the like. Then
+    all are dealt anew, from the log in which most is missing to the least; pieces of logs train, as
     ever. No effect has been looked for when this is decided.
 
     Args:
@@ -125,4 +125,5 @@ def _lopsided(left: Mapping[str, Array]) -> bool:
     if sum(int((errors > _SHOWS).sum()) for errors in left.values()) < 2:
         return False
     most = {name: float(errors.max(initial=1.0)) - 1.0 for name, errors in left.items()}
-    return min(most.values()) < _SHOWS - 1.0 or max(most.values()) > _FAR * most["train"]
+    far = max(most.values()) > _FAR * most["train"] and most["train"] < _PLENTY
+    return far or min(most.values()) < _SHOWS - 1.0
