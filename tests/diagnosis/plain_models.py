@@ -17,12 +17,17 @@ class Unit(NamedTuple):
     where: str = "hip"
     high: float = 1.0
     direction: tuple[float, ...] = (1.0,)
+    group: str = ""  # default its name
+    channel: str = "body"
 
     @property
     def effect(self):
         joint = ["hip", "knee", "x", "y"].index(self.where)
         return SimpleNamespace(
-            group=self.name, placed=(), channel="body", joint=lambda robot, target: joint
+            group=self.group or self.name,
+            placed=(),
+            channel=self.channel,
+            joint=lambda robot, target: joint,
         )
 
 

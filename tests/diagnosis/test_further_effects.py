@@ -1,7 +1,6 @@
 """What makes a further effect more than a stopgap."""
 
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import pytest
 from plain_models import A, C, Unit, plain
@@ -122,31 +121,8 @@ def screened(ratios):
     return SimpleNamespace(units=tuple(ratios), beside=beside), asked
 
 
-def at(name, where, group=None, *, channel="body"):
-    """Return a unit at one of two joints, a sensor's or a force's."""
-    joint = {"knee": 0, "hip": 1}[where]
-    acts = SimpleNamespace(
-        group=group or name, placed=(), channel=channel, joint=lambda robot, target: joint
-    )
-    return Placed(name, where, acts)
-
-
-class Placed(NamedTuple):
-    name: str
-    where: str
-    effect: SimpleNamespace
-    direction: tuple[float, ...] = (1.0,)
-    high: float = 1.0
-
-    def __hash__(self):
-        return hash((self.name, self.where))
-
-    def __eq__(self, other):
-        return (self.name, self.where) == (other.name, other.where)
-
-
-FRICTION, SPRING = at("friction", "knee"), at("spring", "knee")
-SENSOR = at("sensor_gain", "hip", "scale", channel="sensing")
+FRICTION, SPRING = Unit("friction", "knee"), Unit("spring", "knee")
+SENSOR = Unit("sensor_gain", "hip", group="scale", channel="sensing")
 
 
 @pytest.mark.parametrize(
@@ -158,8 +134,8 @@ def test_what_no_law_at_the_same_joint_could_be_is_an_effect_elsewhere(mine, oth
     """Two thirds of what the base leaves, and nothing of the gap."""
     start, base = plain([], 1e5), plain([FRICTION], 590.0)
     better = plain([FRICTION, SENSOR], 445.0)
-    seen, asked = screened({SENSOR: mine, SPRING: 900.0, at("gain", "hip"): other})
-    rival = plain([FRICTION, at("gain", "hip")], 520.0, flipped=True)
+    seen, asked = screened({SENSOR: mine, SPRING: 900.0, Unit("gain", "hip"): other})
+    rival = plain([FRICTION, Unit("gain", "hip")], 520.0, flipped=True)
     given = start, base, better, [better, rival]
     assert not identified(*given)
     assert identified(*given, seen=seen, robot="robot") == added
@@ -190,7 +166,7 @@ def test_what_shows_elsewhere_is_an_effect_although_noise_alone_seems_left(gap, 
     """A pole's friction beside a sensor's gain, of which it leaves a hundredth."""
     start, base = plain([], gap), plain([FRICTION], 440.0)
     better = plain([FRICTION, SENSOR], 390.0)
-    seen, _ = screened({SENSOR: mine, at("gain", "hip"): other, SPRING: 900.0})
+    seen, _ = screened({SENSOR: mine, Unit("gain", "hip"): other, SPRING: 900.0})
     assert further_effects.nothing_left(start, base)
     assert stands_apart(base, seen, "robot") == apart
     assert not identified(start, base, better, [better])
@@ -200,11 +176,11 @@ def test_what_shows_elsewhere_is_an_effect_although_noise_alone_seems_left(gap, 
 
 @pytest.mark.parametrize(("timestep", "added"), [(0.5, True), (2.0, False)])
 def test_where_noise_seems_left_a_delay_is_longer_than_a_time_step(timestep, added):
-    class Late(Placed):
+    class Late(Unit):
         def actual(self, strength):
             return strength
 
-    late = Late("action_delay", "hip", at("action_delay", "hip", "timing").effect)
+    late = Late("action_delay", group="timing")
     start, base, better = (
         plain(units, left)
         for units, left in (([], 2e5), ([FRICTION], 440.0), ([FRICTION, late], 390.0))
@@ -216,6 +192,6 @@ def test_where_noise_seems_left_a_delay_is_longer_than_a_time_step(timestep, add
 
 def test_two_kinds_that_show_elsewhere_alike_stand_not_apart():
     base = plain([FRICTION], 440.0)
-    both = {SENSOR: 60.0, at("gain", "hip"): 50.0}
+    both = {SENSOR: 60.0, Unit("gain", "hip"): 50.0}
     assert not stands_apart(base, screened(both)[0], "robot")
     assert not stands_apart(base, screened({SPRING: 900.0})[0], "robot")

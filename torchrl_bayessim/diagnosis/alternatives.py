@@ -18,7 +18,17 @@ from ..effects.joints import CoulombFriction
 from ..effects.transmission import ServoDeadBand
 from .explanations import compare
 from .form_fit import bendable, fitted_numbers, with_fitted_forms
-from .model import LIKELY, Model, as_good, criterion, gain, judged, needed, numbers
+from .model import (
+    LIKELY,
+    Model,
+    as_good,
+    best_by_effect,
+    criterion,
+    gain,
+    judged,
+    needed,
+    numbers,
+)
 from .objective import Objective, Point, Unit
 from .refit import WIDE, refit
 from .screening import Screen
@@ -121,15 +131,11 @@ def _bent(
     With no more numbers: a payload that is held aside moves the centre of mass in two directions.
     """
     train, most = sets[0], fitted_numbers(sets[0], best, offered)
-    kinds: dict[str, Model] = {}
-    for model in sorted(known, key=lambda m: criterion(m, 1.0)):
-        added, fewer = model.beyond(best), len(model.units) < len(best.units)
-        if added and fewer and bendable(train, added) and not as_good(best, model):
-            kinds.setdefault(added[0].name, model)
-    plain = list(kinds.values())[:_LAWS]
+    fewer = [m for m in known if len(m.units) < len(best.units)]
+    laws = [m for m in fewer if bendable(train, m.beyond(best)) and not as_good(best, m)]
+    plain = list(best_by_effect(laws, best).values())[:_LAWS]
     fitted = [with_fitted_forms(*sets, model, offered) for model in plain]
-    fitted = [bent for bent in fitted if bent not in plain]
-    return [bent for bent in fitted if fitted_numbers(train, bent, offered) <= most]
+    return [m for m in fitted if m not in plain and fitted_numbers(train, m, offered) <= most]
 
 
 def _names(model: Model) -> set[str]:

@@ -7,7 +7,7 @@ __all__ = ["chosen", "fewest"]
 from collections.abc import Callable, Sequence
 
 from .form_fit import bendable, fitted_numbers, priced, with_fitted_forms
-from .model import WHITE, Model, as_good, criterion, gain, judged, needed
+from .model import WHITE, Model, as_good, best_by_effect, criterion, gain, judged, needed
 from .objective import Objective, Point, Unit
 from .refit import refit
 
@@ -105,9 +105,7 @@ def _in_other_forms(
     its way.
     """
     train = sets[0]
-    kinds: dict[str, Model] = {}
-    for model in sorted(singles, key=lambda m: criterion(m, 1.0)):
-        kinds.setdefault(model.beyond(base)[0].name, model)
+    kinds = best_by_effect(singles, base)
     laws = [u for u in offered if u.name in kinds and bendable(train, [u])]
     bends = set(kinds) if bendable(train, base.units) else {unit.name for unit in laws}
     plain = [m for name, m in kinds.items() if name in bends]

@@ -222,13 +222,14 @@ def _fittest(
         alike: How many of a set.
     """
     order = sorted(fits, key=lambda f: _priced(f, f.misfit))
-    added = {id(fit): len({u.name for u in fit.units if u not in there}) for fit in fits}
-    fewest = min(added.values())
-    half = _apart([fit for fit in order if added[id(fit)] == fewest], most // 2, alike)
+    added = [len({u.name for u in fit.units if u not in there}) for fit in order]
+    fewest = min(added)
+    few = [fit for fit, count in zip(order, added, strict=True) if count == fewest]
+    half = _apart(few, most // 2, alike)
     chosen = _apart([*half, *(fit for fit in order if fit not in half)], most, alike)
     for names in {_names(fit): None for fit in chosen}:
         plainest = min((f for f in order if _names(f) == names), key=lambda f: len(f.units))
-        if all(set(fit.units) != set(plainest.units) for fit in chosen):
+        if plainest not in chosen:
             chosen.append(plainest)
     return sorted(chosen, key=order.index)
 

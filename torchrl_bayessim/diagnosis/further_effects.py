@@ -93,7 +93,7 @@ def _matters(
     if _leaves_less(start, base, _REMAINS):
         # a simulator that integrates otherwise is late, too, by a part of its time step
         second = len({unit.name for unit in base.units if _does_something(unit, better)}) <= 1
-        second &= ActionDelay.group not in added or _later(base, better, timestep)
+        second &= not _within_a_step(base, better, timestep)
         if not second or not (just_this or (lone and removed > _REST)):
             return False
     return (before > _WRONG or just_this) and not _rivalled(base, better, models)
@@ -113,7 +113,7 @@ def _numerical(start: Model, base: Model, better: Model, timestep: float) -> boo
     """
     if start.mean_square - 1.0 > (base.mean_square - better.mean_square) / _LEAST:
         return True
-    return ActionDelay.group in _added(base, better) and not _later(base, better, timestep)
+    return _within_a_step(base, better, timestep)
 
 
 def _elsewhere(base: Model, better: Model, seen: Screen, robot: Robot, *, far: float) -> bool:
@@ -173,11 +173,13 @@ def _does_something(unit: Unit, model: Model) -> bool:
     return float((model.fit.change(unit) ** 2).sum()) > LIKELY
 
 
-def _later(base: Model, better: Model, timestep: float) -> bool:
-    """Return whether a delay that is added is longer than a time step."""
+def _within_a_step(base: Model, better: Model, timestep: float) -> bool:
+    """Return whether something late is added, and no delay that is longer than a time step."""
+    if ActionDelay.group not in _added(base, better):
+        return False
     strengths = better.fit.point.strengths
     delays = [u for u in strengths if u not in base.units and u.name in _DELAYS]
-    return any(unit.actual(strengths[unit]) > timestep for unit in delays)
+    return not any(unit.actual(strengths[unit]) > timestep for unit in delays)
 
 
 def _rivalled(base: Model, better: Model, models: Sequence[Model]) -> bool:

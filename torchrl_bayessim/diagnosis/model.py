@@ -7,6 +7,7 @@ __all__ = [
     "WHITE",
     "Model",
     "as_good",
+    "best_by_effect",
     "criterion",
     "gain",
     "judged",
@@ -15,7 +16,7 @@ __all__ = [
     "price",
 ]
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,6 +82,14 @@ def criterion(model: Model, dispersion: float) -> float:
     """Return the deviance of all segments plus a price per number; smaller is better."""
     total = float(model.deviances().sum())
     return total / dispersion + numbers(model) * price(model)
+
+
+def best_by_effect(models: Iterable[Model], base: Model) -> dict[str, Model]:
+    """Return the best model by the first effect that it has beyond a base, the best first."""
+    best: dict[str, Model] = {}
+    for model in sorted(models, key=lambda m: criterion(m, 1.0)):
+        best.setdefault(model.beyond(base)[0].name, model)
+    return best
 
 
 def numbers(model: Model) -> int:

@@ -127,8 +127,8 @@ def select(
         alternatives, train, validation,
         units=_with_forms(units, needs), first=screens[0], offered=offered,
     )  # fmt: skip
-    settled = _settled(train, validation, needs, instead, tried=tried, progress=progress)
-    found = start, settled[0], tuple(screens), tuple(p_values), tuple(tried), settled[1]
+    best, others = _settled(train, validation, needs, instead, tried=tried, progress=progress)
+    found = start, best, tuple(screens), tuple(p_values), tuple(tried), others
     return Selection(*found, offered=tuple(offered))
 
 

@@ -104,11 +104,9 @@ def dealt_anew(
     names = list(parts)
     every = np.concatenate([left[name] for name in names])
     logs = [log for name in names for log in parts[name]]
-    pieces = _whole(logs)[1]
-    order = [logs[at] for at in np.argsort(-every, kind="stable")]
-    whole = [log for log in order if not any(log is piece for piece in pieces)]
+    whole, pieces = _whole([logs[at] for at in np.argsort(-every, kind="stable")])
     again = _dealt(whole, _AGAIN)
-    again["train"] += [log for log in order if any(log is piece for piece in pieces)]
+    again["train"] += pieces
     return again
 
 
