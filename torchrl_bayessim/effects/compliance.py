@@ -180,7 +180,8 @@ def _handed_on(passed: Tensor, now: Now) -> Mapping[str, Tensor]:
     A rotor that is stopped may exert more than its motor.
     """
     changed = change(passed, now)
-    beyond = passed - now.under(now.command + changed["command"]).actuator_force
+    command = now.command + changed["command"]
+    beyond = passed - now.actuators.force(command, now.position, now.actuator_velocity)
     return {**changed, "force": beyond @ now.actuators.moment}
 
 

@@ -55,7 +55,7 @@ class Forcing:
     def __init__(self, robot: Robot) -> None:
         model = robot.require_model()
         self.robot, self._nv, self._timestep = robot, model.nv, float(model.opt.timestep)
-        self._qpos, self._dofs = list(robot.qpos_index), list(robot.dof_index)
+        self._qpos, self._dofs = _at(robot.qpos_index), _at(robot.dof_index)
         self._actuators = _Actuators(robot)
 
     def start(self, active: Active, state: Readings) -> list[Memory]:
@@ -155,6 +155,7 @@ class _Actuators:
         self.gain = torch.from_numpy(model.actuator_gainprm[:, 0].copy())
         affine = torch.from_numpy(model.actuator_biastype != 0)[:, None]
         self._bias = torch.where(affine, torch.from_numpy(model.actuator_biasprm[:, :3].copy()), 0)
+        self._servos = bool(self._bias[:, 1:].any())
         self._command_limits = _limits(model.actuator_ctrllimited, model.actuator_ctrlrange)
         self._force_limits = _limits(model.actuator_forcelimited, model.actuator_forcerange)
 
@@ -166,10 +167,17 @@ class _Actuators:
     def demanded(self, command: Tensor, position: Tensor, velocity: Tensor) -> Tensor:
         """Return the same without limits."""
         force = self.gain * command + self._bias[:, 0]
-        if self._bias[:, 1:].any():  # a servo
+        if self._servos:
             force = force + self._bias[:, 1] * (position @ self.moment.T)
             force = force + self._bias[:, 2] * velocity
         return force
+
+
+def _at(indices: Sequence[int]) -> slice | list[int]:
+    """Return where numbers are, as a slice if they follow each other: a view costs less."""
+    first, count = min(indices, default=0), len(indices)
+    inside = tuple(indices) == tuple(range(first, first + count))
+    return slice(first, first + count) if inside else list(indices)
 
 
 def _limits(limited: object, ranges: object) -> tuple[Tensor, Tensor]:

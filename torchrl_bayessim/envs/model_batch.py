@@ -61,6 +61,7 @@ class ModelBatch:
         self.num_envs = num_envs
         self.table: NDArray[np.float64] = np.empty((num_envs, 0))
         self._columns: dict[_Place, int] = {}
+        self._nominals: list[float] = []  # of the columns
         self._bounding: list[_Place] = []  # those that `fit_bounds` looks at
         self._places: dict[Assignments, NDArray[np.int64]] = {}
         self._scratch: list[Scratch] = []
@@ -207,15 +208,14 @@ class ModelBatch:
     def resize(self, num_envs: int) -> None:
         """Change the number of environments; new ones have the nominal physics."""
         if num_envs > self.num_envs:
-            nominal = [self._nominal(*key) for key in self._columns]
-            more = np.tile(np.array(nominal), (num_envs - self.num_envs, 1))
+            more = np.tile(np.array(self._nominals), (num_envs - self.num_envs, 1))
             self.table = np.concatenate([self.table, more])
         self.table = self.table[:num_envs].copy()
         self.num_envs = num_envs
 
     def restore(self) -> None:
         """Give all environments the nominal physics."""
-        self.table[:] = [self._nominal(*key) for key in self._columns]
+        self.table[:] = self._nominals
 
     def repeated(self, count: int) -> ModelBatch:
         """Return a batch in which the physics of each environment stands ``count`` times in a row.
@@ -224,12 +224,17 @@ class ModelBatch:
         """
         other = ModelBatch(self.model, self.num_envs * count, threads=self.threads)
         other._columns, other._bounding = dict(self._columns), list(self._bounding)
+        other._nominals = list(self._nominals)
         other.table = np.repeat(self.table, count, axis=0)
         return other
 
     def overrides(self, other: ModelBatch) -> bool:
         """Return whether all entries that ``other`` overrides are overridden here."""
         return other._columns.keys() <= self._columns.keys()
+
+    def same_columns(self, other: ModelBatch) -> bool:
+        """Return whether the tables override the same entries in the same order."""
+        return list(self._columns) == list(other._columns)
 
     def addresses(self, model: mujoco.MjModel) -> NDArray[np.int64]:
         """Return where the columns of the table belong in a copy of the model, shape ``(K,)``.
@@ -255,6 +260,7 @@ class ModelBatch:
         column = np.full((self.num_envs, 1), value)
         self.table = np.concatenate([self.table, column], axis=1)
         self._columns[field, indices] = len(self._columns)
+        self._nominals.append(value)
         return self._columns[field, indices]
 
     def _nominal(self, field: str, indices: tuple[int, ...]) -> float:

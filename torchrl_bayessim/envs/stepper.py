@@ -11,6 +11,7 @@ from __future__ import annotations
 __all__ = ["Stepper"]
 
 import os
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 
@@ -28,6 +29,7 @@ from .threads import Threads
 from .worker import Worker, layout
 
 _SIGNATURE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_HANDING_OVER = 2e-4  # s: less work than this is not worth another thread
 
 
 class Stepper:
@@ -96,6 +98,7 @@ class Stepper:
         self._workers = [self._hire()]
         self._pool = Threads(self._threads)
         self._running: list[Future[None]] = []
+        self._pace = 1e-5  # s per time step, as last seen
         self._queue = np.zeros(1, dtype=np.int64)
         self._drive = resolved(model, drive, sites)
         self._sharing = sharing
@@ -126,11 +129,12 @@ class Stepper:
         if models.num_envs * self._sharing != self.num_envs:
             expected = f"the physics of {self.num_envs // self._sharing} environments"
             raise ValueError(message(expected, models.num_envs))
-        if models.overrides(self.models):
-            for worker in self._workers:  # the columns may be in another order
-                worker.addresses = np.empty(0, dtype=np.int64)
-        else:  # what the former physics override stands in the models of the workers
-            self._workers = [self._hire() for _ in self._workers]
+        if not models.same_columns(self.models):
+            if models.overrides(self.models):
+                for worker in self._workers:  # the columns may be in another order
+                    worker.addresses = np.empty(0, dtype=np.int64)
+            else:  # what the former physics override stands in the models of the workers
+                self._workers = [self._hire() for _ in self._workers]
         self.models = models
 
     def __getitem__(self, component: str) -> NDArray[np.float64]:
@@ -160,7 +164,7 @@ class Stepper:
         rows = self._all if rows is None else _within(rows, self.num_envs, "simulations")
         outputs = self.outputs[:, 0] if outputs is None else outputs
         _check_room(outputs, rows, (self.output_size,))
-        self._run(native.begin, rows, outputs)
+        self._run(native.begin, rows, outputs, steps=len(rows))
 
     def rollout(
         self,
@@ -206,7 +210,8 @@ class Stepper:
         _within(sequence[rows], len(commands), "sequences of commands")
         commands = np.asarray(commands, dtype=np.float64)
         arguments = commands, sequence, substeps
-        self._run(native.advance, rows, outputs, *arguments, meanwhile=meanwhile)
+        steps = len(rows) * commands.shape[1] * substeps
+        self._run(native.advance, rows, outputs, *arguments, steps=steps, meanwhile=meanwhile)
         return outputs
 
     def _run(
@@ -215,15 +220,20 @@ class Stepper:
         rows: NDArray[np.int64],
         outputs: NDArray[np.float64],
         *arguments: object,
+        steps: int,
         meanwhile: Callable[[], None] | None = None,
     ) -> None:
-        """Let all threads work through the rows, this one among them if it has nothing to do."""
+        """Let threads work through the rows, this one among them if it has nothing to do.
+
+        As many as have enough to do, by the time that so many steps took before.
+        """
         wait(self._running)  # after an interrupt
         self._queue[0] = 0
         batch = self.models.table, self._sharing, self.state, _SIGNATURE
         shared = self._drive, self._queue, rows, outputs, self.status, *arguments
+        most = max(1, int(steps * self._pace / _HANDING_OVER))
         calls = []
-        for worker in self._workers:
+        for worker in self._workers[:most]:
             if len(worker.addresses) != self.models.table.shape[1]:
                 worker.addresses = self.models.addresses(worker.model)
             owned = worker.owned, worker.blocks, worker.addresses, worker.jacobian
@@ -231,8 +241,11 @@ class Stepper:
         own = calls[:1] if meanwhile is None else []
         self._running = [self._pool.submit(kernel, *call) for call in calls[len(own) :]]
         try:
+            begun = time.perf_counter()
             for call in own:
                 kernel(*call)
+            if own and steps:
+                self._pace = (time.perf_counter() - begun) * len(calls) / steps
             if meanwhile is not None:
                 meanwhile()
         finally:  # they write to the states
