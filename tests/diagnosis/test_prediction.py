@@ -77,7 +77,9 @@ def deterministic(robot):
     units = units_of([effect(name) for name in CATALOGUE], robot)
     units = [u for u in units if not u.effect.random and not isinstance(u.effect, SensorEffect)]
     idle = "com_shift[upper y]", "com_shift[lower y]"  # along the axis of all joints
-    return {str(u): u for u in units if u.where != "all" and str(u) not in idle}
+    bristles = units_of([effect("coulomb_friction", presliding=0.01)], robot)
+    named = {str(u): u for u in units if u.where != "all" and str(u) not in idle}
+    return named | {f"{u}, presliding": u for u in bristles if u.where != "all"}
 
 
 ARM_UNITS = deterministic(System(task=arm()).robot)

@@ -22,6 +22,7 @@ _BENT = {
     "softness": ", softness {:.2g}", "bend": ", bent by {:+.2g}",
     "settling": ", settling at {:.2g} per second",
     "second": ", {:.0%} of it in a second filter",
+    "presliding": ", after {:.2g} of presliding",
     "aside": ", {:+.2g} of its distance beside the end",
 }  # fmt: skip
 

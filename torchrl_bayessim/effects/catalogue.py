@@ -88,7 +88,7 @@ def effect(name: str, **options: Any) -> Effect:
     """
     if name not in CATALOGUE:
         raise KeyError(message("an effect of the catalogue", name, available=CATALOGUE))
-    return CATALOGUE[name](**options)
+    return CATALOGUE[name].law(**options)
 
 
 def each_once(effects: Sequence[str | Effect]) -> None:

@@ -120,6 +120,11 @@ class Effect(ABC):
         options = ", ".join(f"{name}={value!r}" for name, value in vars(self).items())
         return f"{type(self).__name__}({options})"
 
+    @classmethod
+    def law(cls, **options: Any) -> Effect:
+        """Return the law of this name that has these options."""
+        return cls(**options)
+
     @property
     def form(self) -> dict[str, Any]:
         """What the law has beside its strength, by the names of the options."""

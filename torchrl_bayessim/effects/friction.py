@@ -4,21 +4,84 @@ Dry friction raises ``frictionloss`` and viscous friction ``damping``, which MuJ
 implicitly: joints stick, and large values stay stable. Strengths are per joint; ``v`` is the
 joint's velocity, ``F_max`` and ``v_max`` its force and velocity scales. Friction without these
 dependences is in `joints`. Sources: Armstrong-Hélouvry, Dupont, Canudas de Wit, Automatica 30
-(1994) for the laws; Duclusaud et al., arXiv 2410.08650, for load.
+(1994) for the laws; Duclusaud et al., arXiv 2410.08650, for load; Dahl, Aerospace Corporation
+TOR-0158(3107-18)-1 (1968), for presliding.
 """
 
 from __future__ import annotations
 
-__all__ = ["DirectionalFriction", "LoadDependentFriction", "QuadraticDrag", "StribeckFriction"]
+__all__ = [
+    "DirectionalFriction",
+    "LoadDependentFriction",
+    "PreslidingFriction",
+    "QuadraticDrag",
+    "StribeckFriction",
+]
 
 from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
+from ..scalars import check_number
 from .effect import ForceEffect, Memory, Now, Reach
+from .history import filled
 from .laws import within
 from .robot import Robot
+
+_PRESLIDING = 0.005  # rad or m
+
+
+class PreslidingFriction(ForceEffect):
+    r"""Dry friction of ``s`` that gives way before it slides, as bristles do; N m or N.
+
+    Up to 30 % of ``F_max``. The law of Dahl (1968), for bristles that are bent by ``z``::
+
+        force −k z,  ż = v − |v| z / z_s,  k = s / z_s,
+
+    solved exactly for the speed at the beginning of a time step, and to first order, as a damping,
+    for what the speed changes within it: what sticks is on a spring, however stiff. After every
+    reversal friction turns round over a way of some ``z_s``.
+
+    Args:
+        presliding: ``z_s``, rad or m. A diagnosis fits it.
+
+    Raises:
+        ValueError: ``presliding`` is not above 0: friction without it is `joints.CoulombFriction`.
+    """
+
+    name, unit, group = "coulomb_friction", "N m", "friction"
+
+    def __init__(self, presliding: float = _PRESLIDING) -> None:
+        check_number("presliding, a way before friction slides", presliding, above=0.0)
+        self.presliding = presliding
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the way, up to a tenth of the robot's."""
+        most = max(0.1 * reach.position, 2 * _PRESLIDING)
+        return {"presliding": (0.05 * self.presliding, 0.1 * _PRESLIDING, most)}
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 0.3 ``F_max``."""
+        return within(robot.force_scale, 0.0, 0.3)
+
+    def start(self, velocity: Tensor) -> Memory:
+        """Return nothing known of the bristles: bent as if the joint had moved on and on."""
+        return {"bent": torch.full_like(velocity, torch.nan)}
+
+    def forces(
+        self, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Mapping[str, Tensor], Memory]:
+        """Return the bristles' force at the end of this time step."""
+        sign, stiffness = now.velocity.sign(), strength / self.presliding
+        slid = self.presliding * sign
+        before = filled(memory["bent"], slid)
+        left = torch.exp(-now.velocity.abs() * now.timestep / self.presliding)
+        after = slid + (before - slid) * left
+        # the derivative of k z by the speed
+        damping = stiffness * now.timestep * (1 - sign * before / self.presliding) * left
+        force = damping * now.velocity - stiffness * after
+        return {"force": force, "damping": damping}, {"bent": after}
 
 
 class StribeckFriction(ForceEffect):

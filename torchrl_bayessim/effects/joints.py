@@ -9,12 +9,13 @@ from __future__ import annotations
 __all__ = ["Armature", "CoulombFriction", "ParallelSpring", "ViscousFriction"]
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from .effect import Fields, ModelEffect, Reach
+from .effect import Effect, Fields, ModelEffect, Reach
+from .friction import PreslidingFriction
 from .laws import within
 from .robot import Robot
 
@@ -44,9 +45,22 @@ class _Joint(ModelEffect):
 
 
 class CoulombFriction(_Joint):
-    """Dry friction of ``s``; N m or N, 0 to 30 % of ``F_max``."""
+    """Dry friction of ``s``; N m or N, 0 to 30 % of ``F_max``.
+
+    By the same name, with an option ``presliding``: `friction.PreslidingFriction`.
+    """
 
     name, unit, group, field = "coulomb_friction", "N m", "friction", "dof_frictionloss"
+
+    @classmethod
+    def law(cls, **options: Any) -> Effect:
+        """Return dry friction, with presliding if that is among the options."""
+        return PreslidingFriction(**options) if options else cls()
+
+    def forms(self, seconds: float) -> tuple[Effect, ...]:
+        """Return the law without and with presliding."""
+        del seconds
+        return self, PreslidingFriction()
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.3 ``F_max``."""

@@ -1,0 +1,118 @@
+"""Dry friction that gives way before it slides, against Dahl's equation and dry friction."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+from torchrl_bayessim.effects.catalogue import effect
+from torchrl_bayessim.effects.forcing import Forcing
+from torchrl_bayessim.effects.friction import PreslidingFriction
+from torchrl_bayessim.effects.robot import robot_of
+from torchrl_bayessim.envs.task import Readings, Task
+
+INERTIA, FRICTION = 0.05, 0.4  # kg m², N m
+WHEEL = f"""<mujoco><option timestep="{{dt}}" gravity="0 0 0"/><worldbody><body>
+  <joint name="axle" axis="0 0 1" damping="{{damping}}"/>
+  <inertial pos="0 0 0" mass="1" diaginertia="{INERTIA} {INERTIA} {INERTIA}"/></body></worldbody>
+  <actuator><motor name="motor" joint="axle" ctrlrange="-2 2"/></actuator></mujoco>"""
+
+
+def turned(law, torque, *, seconds, dt=0.001, damping=0.0):
+    """Return the angles of a wheel that rubs, at the ends of time steps."""
+    model = mujoco.MjModel.from_xml_string(WHEEL.format(dt=dt, damping=damping))
+    data, forcing = mujoco.MjData(model), Forcing(robot_of(Task(model=model, frame_skip=1)))
+    active = [(law, torch.tensor([FRICTION]).double())]
+
+    def readings():
+        given = {"qpos": data.qpos, "qvel": data.qvel, "ctrl": data.ctrl, "time": [data.time]}
+        return Readings(**{name: torch.tensor(np.array(v)) for name, v in given.items()})
+
+    memories, angles = forcing.start(active, readings()), []
+    for _ in range(round(seconds / dt)):
+        data.ctrl[:] = torque(data.time)
+        added, memories = forcing(active, memories, readings())
+        for name in "dof_damping", "dof_frictionloss":
+            base = damping if name == "dof_damping" else 0.0
+            getattr(model, name)[:] = base + added[name].numpy() if name in added else base
+        if "qfrc_applied" in added:
+            data.qfrc_applied[:] = added["qfrc_applied"].numpy()
+        mujoco.mj_step(model, data)
+        angles.append(data.qpos[0])
+    return np.array(angles)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.7])
+def test_what_sticks_gives_way_by_as_much_as_dahl_says(share):
+    way = 0.03
+    law = effect("coulomb_friction", presliding=way)
+    angles = turned(law, lambda _: share * FRICTION, seconds=6.0, damping=1.5)
+    assert angles[-1] == pytest.approx(-way * math.log(1 - share), rel=1e-3)
+
+
+@pytest.mark.parametrize("way", [0.005, 0.1])
+def test_a_wheel_follows_the_differential_equation(way):
+    def torque(t):
+        return 1.2 * FRICTION * math.sin(5 * t) + 0.3 * math.sin(13 * t)
+
+    def rates(t, state):
+        _, v, z = state
+        held = FRICTION * z / way
+        return v, (torque(t) - held) / INERTIA, v - abs(v) * z / way
+
+    seconds, dt = 2.0, 0.0005
+    ends = np.arange(1, round(seconds / dt) + 1) * dt
+    true = solve_ivp(
+        rates, (0, seconds), [0, 0, 0], t_eval=ends, rtol=1e-9, atol=1e-10, method="LSODA"
+    )
+    angles = turned(effect("coulomb_friction", presliding=way), torque, seconds=seconds, dt=dt)
+    largest = np.abs(true.y[0]).max()
+    assert np.abs(angles - true.y[0]).max() < 0.01 * largest
+    other = turned(PreslidingFriction(2 * way), torque, seconds=seconds, dt=dt)
+    assert np.abs(other - true.y[0]).max() > 0.02 * largest
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.01])
+def test_with_hardly_any_presliding_it_is_dry_friction(dt):
+    model = mujoco.MjModel.from_xml_string(WHEEL.format(dt=dt, damping=0.0))
+    model.dof_frictionloss[:] = FRICTION
+    data, dry = mujoco.MjData(model), []
+    for k in range(round(2.0 / dt)):
+        data.ctrl[:] = 2 * FRICTION * math.sin(5 * k * dt)
+        mujoco.mj_step(model, data)
+        dry.append(data.qpos[0])
+    angles = turned(
+        effect("coulomb_friction", presliding=1e-5),
+        lambda t: 2 * FRICTION * math.sin(5 * t),
+        seconds=2.0,
+        dt=dt,
+    )
+    assert np.abs(angles - dry).max() < 0.05 * np.ptp(dry)
+
+
+def test_what_presliding_makes_of_the_name():
+    law = effect("coulomb_friction", presliding=0.01)
+    assert law == PreslidingFriction(0.01)
+    assert law.name == "coulomb_friction"
+    assert effect(law.name, **law.form) == law
+    assert effect("coulomb_friction").forms(9.0) == (
+        effect("coulomb_friction"),
+        PreslidingFriction(),
+    )
+    with pytest.raises(ValueError, match="presliding, a way before friction slides"):
+        effect("coulomb_friction", presliding=0.0)
+    with pytest.raises(TypeError, match="speed"):
+        effect("coulomb_friction", speed=1.0)
+
+
+def test_without_strength_it_is_nothing():
+    law, now = PreslidingFriction(), torch.tensor([[0.3], [0.0]]).double()
+    state = Readings(qpos=now, qvel=now, ctrl=now, time=now)
+    model = mujoco.MjModel.from_xml_string(WHEEL.format(dt=0.01, damping=0.0))
+    forcing = Forcing(robot_of(Task(model=model, frame_skip=1)))
+    active = [(law, torch.zeros(2, 1).double())]
+    added, _ = forcing(active, forcing.start(active, state), state)
+    assert not any(values.any() for values in added.values())
