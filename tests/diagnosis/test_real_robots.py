@@ -42,6 +42,13 @@ def test_dry_friction_is_found_in_the_pendulum_and_mends_runs_that_were_not_fitt
     assert errors["refit"]["q"] > 2 * errors["with_effects"]["q"]
 
 
+def test_the_pendulum_rubs_without_the_run_that_somebody_pushed():
+    found = report("dfki_simple_pendulum", keep=lambda n: "1kg" not in n and "anomaly" not in n)
+    assert found.confusion_set[0] in FRICTION
+    errors = found.gap.rollout_rmse
+    assert errors["raw"]["q"] > 4 * errors["with_effects"]["q"]
+
+
 def test_a_kilogram_more_is_a_payload_or_as_much_less_torque():
     found = report("dfki_simple_pendulum", keep=lambda name: "1kg" in name)
     assert "payload" in found.confusion_set

@@ -26,7 +26,7 @@ _DEAL = "train", "test", "validation", "train", "train", "test", "validation", "
 # where little shows what is missing, it is to be found before it can be tested
 _AGAIN = "train", "validation", "test", "train", "train", "validation", "test", "train"
 _SHOWS = 1.5  # mean squared innovation of a log in which something is missing
-_FAR, _PLENTY = 1.5, 10.0  # times what is missing in any log that trains; what is enough to fit
+_FAR, _PLENTY = 1.5, 6.0  # times what is missing in any log that trains; what is enough to fit
 
 
 def split(logs: Sequence[Log]) -> dict[str, list[Log]]:
