@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 from rail_cart import cart, ride
-from test_diagnose import ARM, logs
+from test_diagnose import ARM, FINER, logs
 from test_diagnose import system as robot
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
@@ -110,6 +110,28 @@ def test_one_gain_that_bends_is_named_and_not_two_effects_that_imitate_it():
     assert report.effects[0].strength == pytest.approx(0.3, rel=0.1)
     (found,) = report.strengths
     assert found.bend == pytest.approx(-0.5, abs=0.1)
+
+
+class Bristles:
+    """Friction of 0.3 N m that gives way over 30 mrad, in time steps of the recorded robot."""
+
+    def __init__(self):
+        self.bent = 0.0
+
+    def __call__(self, q, v):
+        slid = 0.03 * np.sign(v)
+        self.bent = slid + (self.bent - slid) * np.exp(-abs(v) * 0.002 / FINER / 0.03)
+        return -0.3 * self.bent / 0.03
+
+
+def test_bristles_are_dry_friction_with_the_way_that_they_bend():
+    some = ["coulomb_friction", "directional_friction", "viscous_friction", "parallel_spring"]
+    report = diagnose(robot(), None, logs(push=Bristles()), effects=some)
+    assert [effect.name for effect in report.effects] == ["coulomb_friction"]
+    assert report.effects[0].strength == pytest.approx(0.3, rel=0.03)
+    (found,) = report.strengths
+    assert found.presliding == pytest.approx(0.03, rel=0.15)
+    assert report.gap.with_effects < 1.3
 
 
 def test_a_drift_that_was_taken_to_settle_is_steady_again():
