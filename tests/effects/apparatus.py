@@ -82,33 +82,37 @@ def simulated(robot):
     return torch.stack(record)
 
 
+def driven(model, robot, active, commands):
+    """Yield the data after each time step of plain MuJoCo, with force effects as of a robot."""
+    forcing, data, memories = Forcing(robot), mujoco.MjData(model), None
+    friction, damping = model.dof_frictionloss.copy(), model.dof_damping.copy()
+    for command in torch.as_tensor(commands):
+        state = Readings(
+            qpos=torch.from_numpy(data.qpos.copy()),
+            qvel=torch.from_numpy(data.qvel.copy()),
+            ctrl=command,
+            time=torch.tensor([data.time]).double(),
+        )
+        memories = forcing.start(active, state) if memories is None else memories
+        added, memories = forcing(active, memories, state)
+        data.ctrl[:] = command + added.get("ctrl", 0.0)
+        data.qfrc_applied[:] = added.get("qfrc_applied", torch.zeros(model.nv))
+        model.dof_frictionloss[:] = friction + np.asarray(added.get("dof_frictionloss", 0.0))
+        model.dof_damping[:] = damping + np.asarray(added.get("dof_damping", 0.0))
+        mujoco.mj_step(model, data)
+        yield data
+
+
 def pushed(effect, strength, robot):
-    """Simulate with a force effect, one time step at a time, in plain MuJoCo."""
-    forcing, rows = Forcing(robot), []
+    """Simulate with a force effect in plain MuJoCo."""
+    rows, each = [], commands().repeat_interleave(5, 0)
     for one in strength:
         model = mujoco.MjModel.from_xml_string(ARM)
-        data = mujoco.MjData(model)
-        active, memories, record = [(effect, one)], None, []
-        friction, damping = model.dof_frictionloss.copy(), model.dof_damping.copy()
-        for command in commands():
-            for _ in range(5):
-                state = Readings(
-                    qpos=torch.from_numpy(data.qpos.copy()),
-                    qvel=torch.from_numpy(data.qvel.copy()),
-                    ctrl=command,
-                    time=torch.tensor([data.time]).double(),
-                )
-                memories = forcing.start(active, state) if memories is None else memories
-                added, memories = forcing(active, memories, state)
-                data.ctrl[:] = command + added.get("ctrl", 0.0)
-                data.qfrc_applied[:] = added.get("qfrc_applied", torch.zeros(model.nv))
-                model.dof_frictionloss[:] = friction + np.asarray(
-                    added.get("dof_frictionloss", 0.0)
-                )
-                model.dof_damping[:] = damping + np.asarray(added.get("dof_damping", 0.0))
-                mujoco.mj_step(model, data)
-            record.append(torch.from_numpy(np.concatenate([data.qpos, data.qvel])))
-        rows.append(torch.stack(record))
+        states = [
+            torch.from_numpy(np.concatenate([data.qpos, data.qvel]))
+            for data in driven(model, robot, [(effect, one)], each)
+        ]
+        rows.append(torch.stack(states[4::5]))
     return torch.stack(rows)
 
 

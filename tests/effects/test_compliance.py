@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from apparatus import driven
 from rotor_and_link import gap, one_body, spring, two_bodies
 
 from torchrl_bayessim.effects.catalogue import effect
@@ -32,30 +33,14 @@ def truth(shaft):
     return np.array(found)
 
 
-def driven(model, nominal, active, commands):
-    """Yield the state after each time step, with effects as of the nominal model on the way."""
-    forcing = Forcing(robot_of(Task(model=nominal, frame_skip=4)))
-    data, memories = mujoco.MjData(model), None
-    for u in commands:
-        state = Readings(qpos=torch.tensor(data.qpos), qvel=torch.tensor(data.qvel),
-                         ctrl=torch.tensor(u), time=torch.tensor([data.time]))  # fmt: skip
-        memories = forcing.start(active, state) if memories is None else memories
-        added, memories = forcing(active, memories, state)
-        data.ctrl[:] = u + added["ctrl"].numpy()
-        if "qfrc_applied" in added:
-            data.qfrc_applied[:] = added["qfrc_applied"].numpy()
-        mujoco.mj_step(model, data)
-        yield data
-
-
 def simulated(law, strength, dt):
     """Return them where the rotor is the joint's armature and an effect is between."""
     model, substeps = one_body(dt), round(CONTROL / dt)
     active = [(law, torch.tensor([strength]).double())]
     held = np.repeat(commands(), substeps)[:, None]
-    return np.array([data.qpos[0] for data in driven(model, model, active, held)])[
-        substeps - 1 :: substeps
-    ]
+    robot = robot_of(Task(model=model, frame_skip=4))
+    angles = np.array([data.qpos[0] for data in driven(model, robot, active, held)])
+    return angles[substeps - 1 :: substeps]
 
 
 @cache
@@ -114,9 +99,10 @@ def chain(rotors, actuators=MOTORS):
 
 def fastest(model, nominal, law, share=0.1):
     """Return the largest velocity within three seconds of driving."""
-    strengths = share * law.bounds(robot_of(Task(model=nominal, frame_skip=4)))[1]
+    robot = robot_of(Task(model=nominal, frame_skip=4))
+    strengths = share * law.bounds(robot)[1]
     commands = np.sin(np.arange(600)[:, None] * np.array([0.05, 0.11, 0.17][: model.nu]))
-    states = driven(model, nominal, [(law, strengths)], commands)
+    states = driven(model, robot, [(law, strengths)], commands)
     return max(float(np.abs(data.qvel).max()) for data in states)
 
 

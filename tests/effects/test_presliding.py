@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from apparatus import driven
 from scipy.integrate import solve_ivp
 
 from torchrl_bayessim.effects.catalogue import effect
@@ -21,35 +22,24 @@ WHEEL = f"""<mujoco><option timestep="{{dt}}" gravity="0 0 0"/><worldbody><body>
   <actuator><motor name="motor" joint="axle" ctrlrange="-2 2"/></actuator></mujoco>"""
 
 
-def turned(law, torque, *, seconds, dt=0.001, damping=0.0):
+def wheel(dt, damping=0.0):
+    return mujoco.MjModel.from_xml_string(WHEEL.format(dt=dt, damping=damping))
+
+
+def turned(model, laws, torque, seconds):
     """Return the angles of a wheel that rubs, at the ends of time steps."""
-    model = mujoco.MjModel.from_xml_string(WHEEL.format(dt=dt, damping=damping))
-    data, forcing = mujoco.MjData(model), Forcing(robot_of(Task(model=model, frame_skip=1)))
-    active = [(law, torch.tensor([FRICTION]).double())]
-
-    def readings():
-        given = {"qpos": data.qpos, "qvel": data.qvel, "ctrl": data.ctrl, "time": [data.time]}
-        return Readings(**{name: torch.tensor(np.array(v)) for name, v in given.items()})
-
-    memories, angles = forcing.start(active, readings()), []
-    for _ in range(round(seconds / dt)):
-        data.ctrl[:] = torque(data.time)
-        added, memories = forcing(active, memories, readings())
-        for name in "dof_damping", "dof_frictionloss":
-            base = damping if name == "dof_damping" else 0.0
-            getattr(model, name)[:] = base + added[name].numpy() if name in added else base
-        if "qfrc_applied" in added:
-            data.qfrc_applied[:] = added["qfrc_applied"].numpy()
-        mujoco.mj_step(model, data)
-        angles.append(data.qpos[0])
-    return np.array(angles)
+    dt = model.opt.timestep
+    commands = np.array([[torque(k * dt)] for k in range(round(seconds / dt))])
+    active = [(law, torch.tensor([FRICTION]).double()) for law in laws]
+    robot = robot_of(Task(model=model, frame_skip=1))
+    return np.array([data.qpos[0] for data in driven(model, robot, active, commands)])
 
 
 @pytest.mark.parametrize("share", [0.2, 0.7])
 def test_what_sticks_gives_way_by_as_much_as_dahl_says(share):
     way = 0.03
     law = effect("coulomb_friction", presliding=way)
-    angles = turned(law, lambda _: share * FRICTION, seconds=6.0, damping=1.5)
+    angles = turned(wheel(0.001, damping=1.5), [law], lambda _: share * FRICTION, 6.0)
     assert angles[-1] == pytest.approx(-way * math.log(1 - share), rel=1e-3)
 
 
@@ -68,28 +58,24 @@ def test_a_wheel_follows_the_differential_equation(way):
     true = solve_ivp(
         rates, (0, seconds), [0, 0, 0], t_eval=ends, rtol=1e-9, atol=1e-10, method="LSODA"
     )
-    angles = turned(effect("coulomb_friction", presliding=way), torque, seconds=seconds, dt=dt)
+    law = effect("coulomb_friction", presliding=way)
+    angles = turned(wheel(dt), [law], torque, seconds)
     largest = np.abs(true.y[0]).max()
     assert np.abs(angles - true.y[0]).max() < 0.01 * largest
-    other = turned(PreslidingFriction(2 * way), torque, seconds=seconds, dt=dt)
+    other = turned(wheel(dt), [PreslidingFriction(2 * way)], torque, seconds)
     assert np.abs(other - true.y[0]).max() > 0.02 * largest
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.01])
 def test_with_hardly_any_presliding_it_is_dry_friction(dt):
-    model = mujoco.MjModel.from_xml_string(WHEEL.format(dt=dt, damping=0.0))
-    model.dof_frictionloss[:] = FRICTION
-    data, dry = mujoco.MjData(model), []
-    for k in range(round(2.0 / dt)):
-        data.ctrl[:] = 2 * FRICTION * math.sin(5 * k * dt)
-        mujoco.mj_step(model, data)
-        dry.append(data.qpos[0])
-    angles = turned(
-        effect("coulomb_friction", presliding=1e-5),
-        lambda t: 2 * FRICTION * math.sin(5 * t),
-        seconds=2.0,
-        dt=dt,
-    )
+    def torque(t):
+        return 2 * FRICTION * math.sin(5 * t)
+
+    rubbing = wheel(dt)
+    rubbing.dof_frictionloss[:] = FRICTION
+    dry = turned(rubbing, [], torque, 2.0)
+    law = effect("coulomb_friction", presliding=1e-5)
+    angles = turned(wheel(dt), [law], torque, 2.0)
     assert np.abs(angles - dry).max() < 0.05 * np.ptp(dry)
 
 
@@ -111,8 +97,7 @@ def test_what_presliding_makes_of_the_name():
 def test_without_strength_it_is_nothing():
     law, now = PreslidingFriction(), torch.tensor([[0.3], [0.0]]).double()
     state = Readings(qpos=now, qvel=now, ctrl=now, time=now)
-    model = mujoco.MjModel.from_xml_string(WHEEL.format(dt=0.01, damping=0.0))
-    forcing = Forcing(robot_of(Task(model=model, frame_skip=1)))
+    forcing = Forcing(robot_of(Task(model=wheel(0.01), frame_skip=1)))
     active = [(law, torch.zeros(2, 1).double())]
     added, _ = forcing(active, forcing.start(active, state), state)
     assert not any(values.any() for values in added.values())
