@@ -60,8 +60,12 @@ class Forcing:
 
     def start(self, active: Active, state: Readings) -> list[Memory]:
         """Return the memories at the beginning, for the batch of ``state``."""
-        velocity = state.qvel[..., self._dofs]
+        velocity = self.velocity(state)
         return [effect.start(velocity) for effect, _ in active]
+
+    def velocity(self, state: Readings) -> Tensor:
+        """Return the joints' velocities, shape ``(*batch, J)``."""
+        return state.qvel[..., self._dofs]
 
     def __call__(
         self,
@@ -108,7 +112,7 @@ class Forcing:
             timestep=timestep,
             time=state.time,
             position=state.qpos[..., self._qpos],
-            velocity=state.qvel[..., self._dofs],
+            velocity=self.velocity(state),
             command=state.ctrl,
             actuator_gain=self._actuators.gain,
             actuators=self._actuators,

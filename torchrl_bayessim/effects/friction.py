@@ -33,7 +33,7 @@ _PRESLIDING = 0.005  # rad or m
 
 
 class PreslidingFriction(ForceEffect):
-    r"""Dry friction of ``s`` that gives way before it slides, as bristles do; N m or N.
+    """Dry friction of ``s`` that gives way before it slides, as bristles do; N m or N.
 
     Up to 30 % of ``F_max``. The law of Dahl (1968), for bristles that are bent by ``z``::
 

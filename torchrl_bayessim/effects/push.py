@@ -43,7 +43,7 @@ class Push:
         active = [(self._effect, self._strength())]
         if self._memory is None:
             (self._memory,) = self._forcing.start(active, state)
-        self._velocity = state.qvel[..., list(self._forcing.robot.dof_index)]
+        self._velocity = self._forcing.velocity(state)
         added, (self._memory,) = self._forcing(active, [self._memory], state)
         return added
 

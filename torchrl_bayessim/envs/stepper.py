@@ -97,7 +97,7 @@ class Stepper:
         self._hire = lambda: Worker(model, arrays)
         self._workers = [self._hire()]
         self._pool = Threads(self._threads)
-        self._running: list[Future[None]] = []
+        self._running: list[Future[float]] = []
         self._pace = 1e-5  # s per time step, as last seen
         self._queue = np.zeros(1, dtype=np.int64)
         self._drive = resolved(model, drive, sites)
@@ -129,12 +129,12 @@ class Stepper:
         if models.num_envs * self._sharing != self.num_envs:
             expected = f"the physics of {self.num_envs // self._sharing} environments"
             raise ValueError(message(expected, models.num_envs))
-        if not models.same_columns(self.models):
-            if models.overrides(self.models):
-                for worker in self._workers:  # the columns may be in another order
-                    worker.addresses = np.empty(0, dtype=np.int64)
-            else:  # what the former physics override stands in the models of the workers
-                self._workers = [self._hire() for _ in self._workers]
+        if not models.overrides(self.models):
+            # what the former physics override stands in the models of the workers
+            self._workers = [self._hire() for _ in self._workers]
+        elif not models.same_columns(self.models):
+            for worker in self._workers:
+                worker.addresses = np.empty(0, dtype=np.int64)
         self.models = models
 
     def __getitem__(self, component: str) -> NDArray[np.float64]:
@@ -239,19 +239,17 @@ class Stepper:
             owned = worker.owned, worker.blocks, worker.addresses, worker.jacobian
             calls.append((owned, batch, *shared))
         own = calls[:1] if meanwhile is None else []
-        self._running = [self._pool.submit(kernel, *call) for call in calls[len(own) :]]
+        others = calls[len(own) :]
+        self._running = [self._pool.submit(_seconds, kernel, *call) for call in others]
         try:
-            begun = time.perf_counter()
-            for call in own:
-                kernel(*call)
-            if own and steps:
-                self._pace = (time.perf_counter() - begun) * len(calls) / steps
+            spent = sum(_seconds(kernel, *call) for call in own)
             if meanwhile is not None:
                 meanwhile()
         finally:  # they write to the states
             wait(self._running)
-        for future in self._running:
-            future.result()
+        spent += sum(future.result() for future in self._running)
+        if steps:
+            self._pace = spent / steps
         self._raise_failures(rows)
 
     def _raise_failures(self, rows: NDArray[np.int64]) -> None:
@@ -272,6 +270,13 @@ class Stepper:
         expected = "room for all contacts and constraints"
         hint = "raise <size memory='…'/> in the MJCF"
         raise SimulationError(message(expected, f"environments {full} without", hint=hint))
+
+
+def _seconds(kernel: Callable[..., None], *call: object) -> float:
+    """Return how long a thread was at it."""
+    begun = time.perf_counter()
+    kernel(*call)
+    return time.perf_counter() - begun
 
 
 def _within(rows: NDArray[np.int64], count: int, what: str) -> NDArray[np.int64]:

@@ -7,6 +7,9 @@ __all__ = ["Threads"]
 import os
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+Result = TypeVar("Result")
 
 
 class Threads:
@@ -24,7 +27,7 @@ class Threads:
         self._count, self._process = count, 0
         self._pool: ThreadPoolExecutor | None = None
 
-    def submit(self, call: Callable[..., None], *arguments: object) -> Future[None]:
+    def submit(self, call: Callable[..., Result], *arguments: object) -> Future[Result]:
         """Let a thread call ``call(*arguments)``."""
         if self._pool is None or self._process != os.getpid():
             self._pool, self._process = ThreadPoolExecutor(self._count), os.getpid()
