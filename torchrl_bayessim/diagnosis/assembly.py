@@ -36,6 +36,7 @@ from .scatter import Scatter
 from .selection import Selection
 from .shrinkage import Shrinkage
 from .verdict import conclude
+from .wavering import wavering_alarms
 from .whole_runs import whole_run_alarm
 
 Array = NDArray[np.float64]
@@ -120,6 +121,7 @@ def assemble(
     elif credit:
         first = max(credit, key=credit.__getitem__)
         rules = acting_regime(prepared, best.fit.point, first)
+        more += wavering_alarms(best, prepared.sets["train"].segments)
         if rules:
             where |= {"regimes": [asdict(rule) for rule in rules], "regimes_of": first}
     names, measured = {effect.name for effect in found.effects}, found.measured

@@ -14,21 +14,22 @@ __all__ = ["Selection", "select"]
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
-from ..logs.system import System
 from .alternatives import alternatives, exchanged
 from .choice import chosen, fewest
 from .elimination import eliminated, without_stopgaps
 from .explanations import bent, compare, explanations
 from .form_fit import with_fitted_forms, with_forms_anew
 from .further_effects import identified, nothing_left, stands_apart
-from .model import Model, judged
+from .model import WHITE, Model, judged
 from .objective import Objective, Point, Unit
 from .refit import Fit, refit
 from .screening import Screen
 from .shapes import with_shapes
+from .wavering import waver
 
 _MOST = 4  # effects in one explanation
 _UNSEEN = 1.0  # a deviance that no test can detect
@@ -86,56 +87,117 @@ def select(
         progress: Told what is done.
     """
     start = judged(train, validation, [nominal])[0]
-    best, tried, screens, p_values, offered = start, [start], [], [], units
-    robot, worth = train.predictor.system.robot, _worth(start, train.predictor.system)
-    for round_number in range(_MOST):
-        progress(f"screening {len(units)} effects, round {round_number + 1}")
-        enough, units = nothing_left(start, best), _with_forms(units, best)
-        left = [u for u in units if u not in best.units]
-        if best.units and not enough:
-            left = with_shapes(left, _beside(best, shapes(best.fit.point)))
-        now = compare(train, best.fit, left)
-        screens.append(now.seen)
-        p_values.append(_p_value(now.seen, best, generator))
-        if known is not None and not best.units:
-            models = _anew(train, validation, known)
-            best, tried = models[0], [start, *models]
-            continue
-        if enough and not stands_apart(best, now.seen, robot):
-            break
-        # where much is left, what a first derivative does not see may still be the cause
-        if p_values[-1] > alpha and not bent(best.fit):
-            break
-        progress("fitting explanations")
-        models = judged(train, validation, explanations(train, now))
-        tried += models
-        better = chosen(best, models)
-        plain = partial(worth, seen=now.seen)
-        better = fewest((train, validation), best, better, models, worth=plain, offered=offered)
-        if better is None or not plain(best, better, models):
-            break
-        exact = _exactly(train, validation, better)
-        best = with_fitted_forms(train, validation, exact, offered)
-        tried += [better, best]
-    progress("taking out what is not needed")
-    needs, dropped = eliminated(train, validation, best)
-    if len(needs.units) < len(best.units):
-        needs = with_forms_anew(train, validation, needs, offered)
-    needs = without_stopgaps(train, validation, needs, offered)
-    tried += [*dropped, needs]
+    search = _Search(
+        train, validation, start, units,
+        known=known, shapes=shapes, alpha=alpha, generator=generator, progress=progress,
+    )  # fmt: skip
+    needs = search.best()
     instead = partial(
         alternatives, train, validation,
-        units=_with_forms(units, needs), first=screens[0], offered=offered,
+        units=_with_forms(search.units, needs), first=search.screens[0], offered=units,
     )  # fmt: skip
-    best, others = _settled(train, validation, needs, instead, tried=tried, progress=progress)
-    found = start, best, tuple(screens), tuple(p_values), tuple(tried), others
-    return Selection(*found, offered=tuple(offered))
+    best, others = _settled(
+        train, validation, needs, instead, tried=search.tried, progress=progress
+    )
+    found = tuple(search.screens), tuple(search.p_values), tuple(search.tried), others
+    return Selection(start, best, *found, offered=tuple(units))
 
 
-def _worth(start: Model, system: System) -> Callable[..., bool]:
+class _Search:
+    """Rounds that each add to a model, and take out again what it does not need."""
+
+    def __init__(
+        self,
+        train: Objective,
+        validation: Objective,
+        start: Model,
+        offered: Sequence[Unit],
+        *,
+        known: Selection | None,
+        shapes: Callable[[Point], Sequence[Unit]],
+        alpha: float,
+        generator: np.random.Generator,
+        progress: Callable[[str], None],
+    ) -> None:
+        self.sets, self.start, self.offered = (train, validation), start, offered
+        self.known, self.shapes, self.alpha = known, shapes, alpha
+        self.generator, self.progress = generator, progress
+        self.worth = _worth(start, train)
+        self.units: Sequence[Unit] = offered
+        self.tried, self.screens, self.p_values = [start], list[Screen](), list[float]()
+
+    def best(self) -> Model:
+        """Return what the data need: what is found beside less than a round had counts too."""
+        best = self.start
+        for rounds in range(1, _MOST + 1):
+            further = self._further(best)
+            if further is None or rounds == _MOST:
+                needs = self._needs(further or best)
+                fewer = len(_names(needs)) < len(_names(further or best))
+                best = needs
+                if not fewer or nothing_left(self.start, needs) or needs.mean_square < WHITE:
+                    break
+            else:
+                best = further
+        return best
+
+    def _further(self, best: Model) -> Model | None:
+        """Return the model with what it lacks most; nothing where it lacks nothing."""
+        train = self.sets[0]
+        self.progress(f"screening {len(self.units)} effects, round {len(self.screens) + 1}")
+        enough, self.units = nothing_left(self.start, best), _with_forms(self.units, best)
+        left = [u for u in self.units if u not in best.units]
+        if best.units and not enough:
+            left = with_shapes(left, _beside(best, self.shapes(best.fit.point)))
+        now = compare(train, best.fit, left)
+        self.screens.append(now.seen)
+        self.p_values.append(_p_value(now.seen, best, self.generator))
+        if self.known is not None and not best.units:
+            models = _anew(*self.sets, self.known)
+            self.tried = [self.start, *models]
+            return models[0]
+        if enough and not stands_apart(best, now.seen, train.predictor.system.robot):
+            return None
+        # where much is left, what a first derivative does not see may still be the cause
+        if self.p_values[-1] > self.alpha and not bent(best.fit):
+            return None
+        self.progress("fitting explanations")
+        models = judged(*self.sets, explanations(train, now))
+        self.tried += models
+        worth = partial(self.worth, seen=now.seen)
+        better = chosen(best, models)
+        better = fewest(self.sets, best, better, models, worth=worth, offered=self.offered)
+        if better is None or not worth(best, better, models):
+            return None
+        fitted = with_fitted_forms(*self.sets, _exactly(*self.sets, better), self.offered)
+        self.tried += [better, fitted]
+        return fitted
+
+    def _needs(self, best: Model) -> Model:
+        """Return the model without the effects that it does not need."""
+        self.progress("taking out what is not needed")
+        needs, dropped = eliminated(*self.sets, best)
+        if len(needs.units) < len(best.units):
+            needs = with_forms_anew(*self.sets, needs, self.offered)
+        needs = without_stopgaps(*self.sets, needs, self.offered)
+        self.tried += [*dropped, needs]
+        return needs
+
+
+def _names(model: Model) -> set[str]:
+    return {unit.name for unit in model.units}
+
+
+def _worth(start: Model, train: Objective) -> Callable[..., bool]:
     """Return what says whether a further effect is more than a stopgap on a robot."""
+    system = train.predictor.system
     timestep = float(system.task.model.opt.timestep)
-    return partial(identified, start, timestep=timestep, robot=system.robot)
+    told = partial(identified, start, timestep=timestep, robot=system.robot)
+
+    def worth(base: Model, better: Model, models: Sequence[Model], **seen: Any) -> bool:
+        return told(base, better, models, **seen) and not waver(base, better, train.segments)
+
+    return worth
 
 
 def _anew(train: Objective, validation: Objective, known: Selection) -> list[Model]:

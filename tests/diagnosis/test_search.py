@@ -1,0 +1,49 @@
+"""Rounds that add to a model, and what they take out again."""
+
+import pytest
+from plain_models import A, C, Unit, plain
+
+from torchrl_bayessim.diagnosis.selection import _Search
+
+WEAK = Unit("magnets", "hip")
+
+
+class Scripted(_Search):
+    """A search of which it is known what its rounds find, and what of that is needed."""
+
+    def __init__(self, further, needs):
+        self.start, self.further, self.needs, self.asked = plain([], 1e6), further, needs, []
+
+    def _further(self, best):
+        self.asked.append(best.units)
+        return self.further.get(best.units)
+
+    def _needs(self, best):
+        return self.needs.get(best.units, best)
+
+
+@pytest.mark.parametrize(
+    ("left", "rounds"), [(20_000.0, 4), (450.0, 3)], ids=["more than noise", "noise alone"]
+)
+def test_what_is_left_without_a_stopgap_is_searched_again(left, rounds):
+    """A centre of mass stood in for a payload, and beside both nothing else seemed worth it."""
+    alone, both, payload = plain([A], 30_000.0), plain([A, C], left - 1), plain([C], left)
+    found = plain([C, WEAK], 440.0)
+    search = Scripted({(): alone, (A,): both, (C,): found}, {(A, C): payload})
+    best = search.best()
+    assert len(search.asked) == rounds
+    assert best is (found if rounds == 4 else payload)
+
+
+def test_a_search_that_goes_in_circles_ends():
+    alone, both, payload = plain([A], 30_000.0), plain([A, C], 20_000.0), plain([C], 20_001.0)
+    search = Scripted({(): alone, (A,): both, (C,): both}, {(A, C): payload})
+    assert search.best() is payload
+    assert len(search.asked) == 4
+
+
+def test_nothing_is_searched_again_where_all_is_needed():
+    alone = plain([A], 30_000.0)
+    search = Scripted({(): alone}, {})
+    assert search.best() is alone
+    assert search.asked == [(), (A,)]
