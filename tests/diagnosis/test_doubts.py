@@ -74,7 +74,9 @@ def test_a_cause_that_may_be_nothing_at_the_end_of_its_range_is_none(monkeypatch
         assert any("may be nothing: its interval" in alarm for alarm in report.alarms)
 
 
-@pytest.mark.parametrize(("low", "verdict"), [(0.5, "named"), (-0.35, "named_partial")])
+@pytest.mark.parametrize(
+    ("low", "verdict"), [(0.8, "named"), (0.5, "named_partial"), (-0.35, "named_partial")]
+)
 def test_a_share_that_may_be_nothing_is_named_with_reserve(low, verdict):
     measured = Shrinkage(9.0, 3.0, 1.0, 1.0, (low, 1.0), (1.0, 4.0), (0.0, 0.1))
     weighed = _Weighed(

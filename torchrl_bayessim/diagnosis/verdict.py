@@ -4,8 +4,9 @@ A goodness-of-fit test always rejects in the end, so the verdict weighs how larg
 how much of it the effects explain, not only whether it is significant::
 
     none           nothing significant, or an excess below 5 % of the noise floor
-    named          effects explain at least 80 %, surely 40 %, and what is left is not significant,
-                   or 2 % and no more than the noise, of several effects a fifth of it
+    named          effects explain at least 80 %, surely 40 % and of other motions some, and what is
+                   left is not significant, or 2 % and no more than the noise, of several effects a
+                   fifth of it
     named_partial  effects explain at least 40 %; the rest is located. Or 80 % on validation runs,
                    where test runs hardly show the gap. Or perhaps 40 %, of a cause that is certain
                    and surely helps on test runs, and leaves less than the noise once more
@@ -201,6 +202,8 @@ class _Weighed:
         nearly_all = measured.explained >= _ALL and measured.effects <= most
         left = 1.0 + measured.remainder_ci[0] > NEGLIGIBLE and not nearly_all
         borne_out = measured.explained >= NAMED and measured.explained_ci[0] >= PARTIAL
+        # what may explain nothing of other motions is no cause that is known
+        borne_out &= measured.elsewhere[0] > 0.0
         # a share of an error that fitting made larger flatters the effects
         borne_out &= not measured.misled or measured.of_raw >= NAMED
         return "named" if borne_out and not left else "named_partial"
