@@ -288,7 +288,7 @@ def a_study(folder, **settings):
 
 def test_a_policy_is_trained_under_the_source_that_its_name_says(run, tmp_path):
     del run
-    study = a_study(tmp_path, simulations=64, domains=0)
+    study = a_study(tmp_path, simulations=128, domains=0)
     trained_under, seen = {}, []
 
     class Watching(PPO):

@@ -50,7 +50,7 @@ def test_an_effect_with_next_to_no_credit_is_named_only_if_nothing_else_can_be_i
     predictor = SimpleNamespace(system=SimpleNamespace(robot="robot"))
     left = worthwhile(selection, {"train": SimpleNamespace(predictor=predictor)})
     assert {one.name for one in left.best.units} == kept
-    assert set(left.alternatives) == kept & set(others)
+    assert set(left.alternatives) == (kept if kept == {"gain"} else set(others))
 
 
 @pytest.mark.parametrize(("share", "changed"), [(0.97, False), (0.5, True)])
@@ -61,3 +61,20 @@ def test_more_strengths_do_not_take_the_place_of_fewer_that_are_as_good(share, c
     fit = replace(more.fit, innovations=np.sqrt(share) * each * more.validation)
     other = Model(fit=fit, validation=fit.innovations, logs=more.logs)
     assert (exchanged(best, {"gain": (other,)}) is other) == changed
+
+
+def test_a_model_of_fewer_effects_has_alternatives_of_its_own():
+    """Not those that were tried beside what it lacks, nor what explains more."""
+    drag, delay, push = Unit("drag"), Unit("delay", "x"), Unit("push")
+    start, best, less = plain([], 1e6), plain([A, C], 500.0), plain([A], 510.0)
+    beside, worse, better = plain([drag, C], 505.0), plain([drag], 512.0), plain([delay], 400.0)
+    tried, others = (
+        (start, worse, better),
+        {"gain": (beside,), "friction": (plain([A, push], 502.0),)},
+    )
+    selection = Selection(start, best, (), (0.0,), tried, others)
+    left = selection.reduced(less, [plain([push], 511.0), plain([push, drag], 509.0)])
+    assert left.best is less
+    assert [[u.name for u in m.units] for m in left.alternatives["gain"]] == [["drag"], ["push"]]
+    assert set(left.alternatives) == {"gain"}
+    assert len(left.tried) == 5

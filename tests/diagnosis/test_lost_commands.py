@@ -14,6 +14,7 @@ from test_lost_values import TWO, run_of_two
 from torchrl_bayessim.diagnosis.arrivals import Arrivals
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.loss_law import LossLaw
+from torchrl_bayessim.diagnosis.losses import evident
 from torchrl_bayessim.diagnosis.lost_commands import _matters, beside_lost_commands
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.preparation import prepare
@@ -150,3 +151,23 @@ def test_what_mends_a_little_of_wrong_decisions_is_no_effect(before, after, matt
     """Of 400 numbers."""
     found = SimpleNamespace(nominal=plain([], 400 * before), best=plain([A], 400 * after))
     assert _matters(found) == matters
+
+
+@pytest.mark.parametrize(("beside", "searched"), [(False, True), (True, False), (None, False)])
+def test_beside_losses_that_were_found_alone_more_is_looked_for(monkeypatch, beside, searched):
+    """However little of what is wrong with their segments they explain."""
+    (unit,) = units_of([PacketDrop()], system().robot)
+    law = SimpleNamespace(deviance=lambda _: 95.0)
+    monkeypatch.setattr("torchrl_bayessim.diagnosis.losses.likeliest", lambda *_, **__: law)
+    monkeypatch.setattr("torchrl_bayessim.diagnosis.losses._plain", lambda *_: False)
+    segments = SimpleNamespace(tried=lambda _: None, point=Point(np.zeros(1)))
+    data = {"train": segments, "validation": segments}
+    alone = SimpleNamespace(law=SimpleNamespace(size=16), costs=[60.0, 40.0])
+    suspects = SimpleNamespace(units=[unit], nominal=data, best=data, alone=alone, rival=alone)
+    selection = SimpleNamespace(best=plain([], 1e3))
+    found = [] if beside is None else [SimpleNamespace(unit=unit, beside=beside)]
+    seen = evident(suspects, selection, found)
+    assert (seen is not None) == searched
+    if seen is not None:
+        assert seen.unit is unit
+        assert seen.without == 100.0

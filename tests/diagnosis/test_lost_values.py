@@ -12,9 +12,11 @@ from test_chance import lost
 from test_diagnose import logs, system
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.found import _matters as found_matters
 from torchrl_bayessim.diagnosis.loss_law import LossLaw, Tried, likeliest
 from torchrl_bayessim.diagnosis.loss_suspects import _explained
 from torchrl_bayessim.diagnosis.model import Model
+from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
 from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.system import System
@@ -230,3 +232,23 @@ def test_packets_that_hold_the_commands_of_all_actuators_are_lost_as_one():
     (found,) = diagnose(robot, None, data, effects=("packet_drop", "action_lag")).effects
     assert (found.name, found.where) == ("packet_drop", "all")
     assert found.ci95[0] < 0.1 < found.ci95[1]
+
+
+@pytest.mark.parametrize(
+    ("gain", "before", "after", "matters"),
+    [
+        (50.0, 2.0, 1.9, True),  # a hundredth of the gap
+        (50.0, 1.0, 0.99, False),
+        (150.0, 1.02, 1.02, True),  # test runs do not show what is certain of others
+        (50.0, 1.02, 1.02, False),
+        (150.0, 1.2, 1.14, True),  # a part of what effects leave
+        (150.0, 1.2, 1.17, False),
+    ],
+)
+def test_chance_beside_effects_has_to_matter(gain, before, after, matters):
+    def left(effects):
+        explained = min((10.0 - effects) / 9.0, 1.0)
+        return Shrinkage(50.0, 10.0, effects, explained, (0.9, 1.0), (8.0, 10.0), (0.0, 1.0))
+
+    scatter = SimpleNamespace(found=[SimpleNamespace(gain=gain)])
+    assert found_matters(scatter, left(before), left(after)) == matters

@@ -6,7 +6,7 @@ would do as well beside the effects that were found since, is fitted here.
 
 from __future__ import annotations
 
-__all__ = ["alternatives", "exchanged", "kind", "leaves_less_to_do"]
+__all__ = ["alternatives", "exchanged", "kind", "leaves_less_to_do", "stands_in"]
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
@@ -68,7 +68,7 @@ def alternatives(
     names = list(dict.fromkeys(unit.name for unit in best.units))
     for name in names:
         kept = {u: s for u, s in best.fit.point.strengths.items() if u.name != name}
-        known = [m for m in tried if _stands_in(m, kept, name)]
+        known = [m for m in tried if stands_in(m, kept, name)]
         if kept:
             base = judged(train, validation, refit(train, [Point(best.fit.point.z, kept)]))[0]
             left = [u for u in units if u not in kept and u.name != name]
@@ -204,7 +204,7 @@ def kind(effect: Effect) -> str:
     return CoulombFriction.group if isinstance(effect, ContactFriction) else effect.group
 
 
-def _stands_in(model: Model, kept: dict[Unit, float], name: str) -> bool:
+def stands_in(model: Model, kept: Collection[Unit], name: str) -> bool:
     """Return whether a model has one other effect beside the kept ones."""
     others = {u.name for u in model.units if u not in kept}
     return set(kept) <= set(model.units) and len(others) == 1 and others != {name}

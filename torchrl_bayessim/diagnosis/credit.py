@@ -39,8 +39,7 @@ def worthwhile(selection: Selection, sets: Mapping[str, Objective]) -> Selection
             return selection  # little of the gap, but most of what is left of it
         if surely_elsewhere(best, selection.best, sets["train"].predictor.system.robot):
             return selection
-        others = {n: models for n, models in selection.alternatives.items() if n != least}
-        selection = replace(selection, best=best, alternatives=others)
+        selection = selection.reduced(best)
 
 
 def _apart(selection: Selection, sets: Mapping[str, Objective]) -> Selection:

@@ -21,8 +21,11 @@ from .report import Finding
 from .scatter import Scatter, Sent
 from .selection import Selection
 from .shrinkage import Shrinkage, shrinkage
+from .validation import NEGLIGIBLE
 
 _WORTH = 0.01  # of the gap on test runs, to name chance beside another cause
+_CERTAIN = 100.0  # deviance on training and validation runs, to be named for less
+_REST = 0.25  # of what effects leave
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,7 @@ def _with_chance(
         return _with_arrivals(found, scatter, scatter.sent, robot)
     if scatter.beside:
         measured = scatter.measured(found.measured, generator)
-        if measured.explained - found.measured.explained > _WORTH:
+        if _matters(scatter, found.measured, measured):
             others = max(found.measured.explained, 0.0)
             found = replace(
                 found,
@@ -103,6 +106,18 @@ def _with_chance(
         effects = scatter.findings(measured, robot)
         found = Found(measured, effects, scatter.strengths(robot), scatter.names)
     return _with_holds(found, scatter) if scatter.holds else found
+
+
+def _matters(scatter: Scatter, before: Shrinkage, after: Shrinkage) -> bool:
+    """Return whether chance beside effects explains some of the gap, or of what they leave.
+
+    Test runs of which effects leave noise alone say nothing against what is certain of others.
+    """
+    if after.explained - before.explained > _WORTH:
+        return True
+    certain = max(one.gain for one in scatter.found) > _CERTAIN
+    left = before.effects - 1.0
+    return certain and (left < NEGLIGIBLE - 1.0 or before.effects - after.effects > _REST * left)
 
 
 def _with_holds(found: Found, scatter: Scatter) -> Found:

@@ -47,6 +47,7 @@ _SHARES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.25, 0.4, 0.6)  # s
 _NEEDED, _LIKELY = 40.0, 6.0
 _EXPLAINED = 0.5  # of the excess of the segments concerned, by what is left of them
 _STANDS_OUT = 1.0  # excess of segments with lost commands, to be found beside an effect
+_CLEARLY = 0.1  # of it, if it is less, may be left
 _BIASED = 0.1  # of the excess of the segments concerned, which parameters leave in all
 _OTHERS = 1 / 6  # of the segments that something else may have spoiled
 _REMAIN = 0.6  # or of those that were spoiled without losses
@@ -81,13 +82,19 @@ class Evident:
         return np.flatnonzero(self.unit.direction).tolist()
 
 
-def evident(suspects: Suspects, selection: Selection) -> Evident | None:
+def evident(
+    suspects: Suspects, selection: Selection, found: Sequence[Chance] = ()
+) -> Evident | None:
     """Return the likeliest losses of commands, if segments are much likelier with any.
+
+    Or those that were found in the place of effects that last.
 
     Args:
         suspects: Short segments.
         selection: What the search without chance found.
+        found: What was found of losses.
     """
+    known = {one.unit for one in found if not one.beside}
     nominal, best, rival = suspects.nominal, suspects.best, suspects.rival
     some = [u for u in suspects.units if isinstance(u.effect, PacketDrop)]
     bases = [(nominal, suspects.alone), *([(best, rival)] if selection.best.units else [])]
@@ -99,7 +106,7 @@ def evident(suspects: Suspects, selection: Selection) -> Evident | None:
             law = likeliest(judged, _SHARES, scatters, SPOILED, size=alone.law.size)
             cost = law.deviance(judged)
             gained = sum(alone.costs) - cost
-            plain = gained > _EVIDENT and _plain(law, judged)
+            plain = unit in known or (gained > _EVIDENT and _plain(law, judged))
             if plain and (likely is None or cost < likely[0]):
                 least = min(sum(other.costs) for _, other in bases)
                 likely = cost, Evident(unit, law, data[JUDGED[0]].point, least, nominal)
@@ -193,8 +200,8 @@ def _found(
 ) -> Chance | None:
     """Return the losses of a unit, nothing if they do not explain what they spoil.
 
-    Commands beside an effect have to stand out: a force law that is not quite the true one errs
-    everywhere a little, as if ever so many of them were lost.
+    Commands beside an effect have to stand out, or to leave nothing of what they spoil: a force law
+    that is not quite the true one errs everywhere a little, as if ever so many of them were lost.
     """
     tried, base = {name: one.tried(unit) for name, one in data.items()}, alone.law
     judged = [tried[name] for name in JUDGED]
@@ -215,7 +222,8 @@ def _found(
         return None  # something else is wrong everywhere, and may look like this
     if excess[1] > _EXPLAINED * excess[0]:
         return None
-    faint = law.share > unit.high or excess[0] < _STANDS_OUT
+    clear = sum(gains) > _EVIDENT and excess[1] < _CLEARLY * excess[0]
+    faint = law.share > unit.high or (excess[0] < _STANDS_OUT and not clear)
     if beside and isinstance(unit.effect, PacketDrop) and faint:
         return None
     share, low, high = np.minimum(law.share_within(judged), unit.high)

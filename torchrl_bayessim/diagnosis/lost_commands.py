@@ -70,7 +70,7 @@ def beside_lost_commands(
         search: Searches for effects that last.
         generator: Of simulated noise.
     """
-    seen = evident(suspects, selection)
+    seen = evident(suspects, selection, found)
     if seen is None:
         return None
     some = _fewer(prepared, len(seen.actuators))
@@ -100,11 +100,8 @@ def _needed(
         least, one, model = min(known, key=lambda each: each[0], default=(np.inf, chance, None))
         if model is None or (chance is not None and least > chance.deviance + _CERTAIN):
             break
-        names = {unit.name for unit in model.units}
-        others = {n: models for n, models in selection.alternatives.items() if n in names}
-        tried = (*selection.tried, *smaller)
         chance = one
-        selection = replace(selection, best=model, alternatives=others, tried=tried)
+        selection = selection.reduced(model, smaller)
     return selection, chance
 
 

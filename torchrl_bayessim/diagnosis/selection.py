@@ -12,19 +12,19 @@ from __future__ import annotations
 __all__ = ["Selection", "select"]
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from .alternatives import alternatives, exchanged
+from .alternatives import alternatives, exchanged, stands_in
 from .choice import chosen, fewest
 from .elimination import eliminated, without_stopgaps
 from .explanations import bent, compare, explanations
 from .form_fit import with_fitted_forms, with_forms_anew
 from .further_effects import identified, nothing_left, stands_apart
-from .model import WHITE, Model, judged
+from .model import LIKELY, WHITE, Model, judged
 from .objective import Objective, Point, Unit
 from .refit import Fit, refit
 from .screening import Screen
@@ -58,6 +58,22 @@ class Selection:
     tried: tuple[Model, ...]
     alternatives: dict[str, tuple[Model, ...]]
     offered: tuple[Unit, ...] = ()
+
+    def reduced(self, best: Model, tried: Sequence[Model] = ()) -> Selection:
+        """Return the selection with a best model of fewer effects, and its own alternatives.
+
+        Args:
+            best: That model. What was tried beside an effect that it lacks is no alternative to it,
+                nor is what explains more: there was a reason not to take that.
+            tried: What else was fitted.
+        """
+        every, others = (*self.tried, *tried), {}
+        least = float(best.deviances().sum()) - LIKELY
+        fair = dict.fromkeys(m for m in every if float(m.deviances().sum()) > least)
+        for name in dict.fromkeys(unit.name for unit in best.units):
+            kept = [unit for unit in best.units if unit.name != name]
+            others[name] = tuple(m for m in fair if stands_in(m, kept, name))
+        return replace(self, best=best, alternatives=others, tried=every)
 
 
 def select(
