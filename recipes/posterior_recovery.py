@@ -7,7 +7,7 @@ Every method gets the same simulations with the same seeds. ``paper_mode=true``:
 protocol (1,000 trajectories of at most 200 steps, 10 real ones): its networks with diagonal and
 full covariance and the mean of the statistics of the real trajectories, once with its own
 statistics and once with ours; and "BayesSim pooled", our defaults, which multiply the posteriors
-of the ten. Otherwise our defaults, the average of four networks, beside sbi's NPE (extra ``sbi``)
+of the ten. Otherwise our defaults, the average of three networks, beside sbi's NPE (extra ``sbi``)
 on the same pairs. Log-densities at one truth reward a posterior that is too sure, so nats over the
 prior and coverage over many other truths stand beside them. Writes result.json, table.md and a
 picture per problem; finished parts are kept in ``out``, so that the same command goes on after a
@@ -242,7 +242,7 @@ def amortised(
     made: dict[str, Callable[[], tuple[Fitted, Any]]] = {}
     several = len(prior.names) > 1
     if not settings.paper_mode:
-        made["BayesSim"] = partial(bayessim, prior, theta, x, networks=4, pool=False, seed=seed)
+        made["BayesSim"] = partial(bayessim, prior, theta, x, networks=3, pool=False, seed=seed)
     else:
         for label, features in {"RFF": "fourier", "NN": "neural"}.items():
             for covariance in ("diagonal", "full") if several else ("diagonal",):

@@ -2,11 +2,9 @@
 
 One network is sure of what it cannot know where pairs are few. Several, with other initial weights
 and minibatches, disagree there, and their average is less sure (deep ensembles, Lakshminarayanan,
-Pritzel & Blundell, 2017, arXiv:1612.01474). Four on one split, the default of `PosteriorRefinement`
-and `sequential`, told 0.02 to 0.07 nats more of other pairs than two on five problems of
-``recipes/posterior_recovery.py``, in 1.3 to 1.5 times their time, and knew better how sure to be
-where two were too sure: their 90 % intervals held 89.2 % of 3,000 truths of PyBullet's Hopper,
-those of two 87.0 %.
+Pritzel & Blundell, 2017, arXiv:1612.01474). Three is the default of `PosteriorRefinement` and
+`sequential`: two were too sure on PyBullet's Hopper, and four take a fifth of the time of ``sbi``'s
+best network on Acrobot, more than a fit is to take (``recipes/posterior_recovery.py``).
 """
 
 from __future__ import annotations

@@ -74,7 +74,7 @@ class PosteriorRefinement:
         prior: Prior,
         *,
         simulations: int = 1024,
-        networks: int = 4,
+        networks: int = 3,
         make_posterior: PosteriorMaker | None = None,
         margin: float = 1.0,
         prior_share: float = 0.25,

@@ -73,7 +73,7 @@ def sequential(
     simulations: int,
     correction: Correction | None = None,
     prior_share: float = 0.2,
-    networks: int = 4,
+    networks: int = 3,
     make_posterior: Callable[[int], MixtureDensityPosterior] | None = None,
     seed: int = 0,
     **fit_options: Any,
