@@ -104,6 +104,7 @@ def test_the_analytic_correction_stays_at_the_known_posterior_round_after_round(
         simulations=600,
         correction="analytic",
         seed=seed,
+        networks=2,
         epochs=40,
         progress=False,
     )
