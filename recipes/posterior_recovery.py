@@ -45,6 +45,7 @@ from workers import workers
 
 from torchrl_bayessim import plots
 from torchrl_bayessim.errors import message
+from torchrl_bayessim.inference.ensemble import NETWORKS
 from torchrl_bayessim.inference.identifiability import identifiability
 from torchrl_bayessim.inference.marginals import marginal_log_prob
 from torchrl_bayessim.simulate import collect_summaries, make_collector
@@ -242,7 +243,9 @@ def amortised(
     made: dict[str, Callable[[], tuple[Fitted, Any]]] = {}
     several = len(prior.names) > 1
     if not settings.paper_mode:
-        made["BayesSim"] = partial(bayessim, prior, theta, x, networks=3, pool=False, seed=seed)
+        made["BayesSim"] = partial(
+            bayessim, prior, theta, x, networks=NETWORKS, pool=False, seed=seed
+        )
     else:
         for label, features in {"RFF": "fourier", "NN": "neural"}.items():
             for covariance in ("diagonal", "full") if several else ("diagonal",):
@@ -256,7 +259,9 @@ def amortised(
                     seed=seed,
                 )
         if pooled:
-            made[BY_PRODUCT] = partial(bayessim, prior, theta, x, networks=3, pool=True, seed=seed)
+            made[BY_PRODUCT] = partial(
+                bayessim, prior, theta, x, networks=NETWORKS, pool=True, seed=seed
+            )
     made["Rejection ABC"] = lambda: (rejection_abc(prior, theta, x), None)
     if settings.npe and not settings.paper_mode:
         for kind in ("mdn", "maf", "nsf"):

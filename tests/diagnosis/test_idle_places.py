@@ -68,11 +68,8 @@ def test_a_model_of_fewer_effects_has_alternatives_of_its_own():
     drag, delay, push = Unit("drag"), Unit("delay", "x"), Unit("push")
     start, best, less = plain([], 1e6), plain([A, C], 500.0), plain([A], 510.0)
     beside, worse, better = plain([drag, C], 505.0), plain([drag], 512.0), plain([delay], 400.0)
-    tried, others = (
-        (start, worse, better),
-        {"gain": (beside,), "friction": (plain([A, push], 502.0),)},
-    )
-    selection = Selection(start, best, (), (0.0,), tried, others)
+    others = {"gain": (beside,), "friction": (plain([A, push], 502.0),)}
+    selection = Selection(start, best, (), (0.0,), (start, worse, better), others)
     left = selection.reduced(less, [plain([push], 511.0), plain([push, drag], 509.0)])
     assert left.best is less
     assert [[u.name for u in m.units] for m in left.alternatives["gain"]] == [["drag"], ["push"]]

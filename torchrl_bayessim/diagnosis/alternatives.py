@@ -110,8 +110,8 @@ def _as_before(
     alone = [m for m in tried if set(m.units) == mine]
     if not kept or not alone:
         return []
-    names = _names(best)
-    others = [m for m in tried if len(_names(m)) == 1 and not _names(m) & names]
+    names = best.names
+    others = [m for m in tried if len(m.names) == 1 and not m.names & names]
     starts = {
         m.units: Point(m.fit.point.z, {**kept, **m.fit.point.strengths})
         for m in others
@@ -136,10 +136,6 @@ def _bent(
     plain = list(best_by_effect(laws, best).values())[:_LAWS]
     fitted = [with_fitted_forms(*sets, model, offered) for model in plain]
     return [m for m in fitted if m not in plain and fitted_numbers(train, m, offered) <= most]
-
-
-def _names(model: Model) -> set[str]:
-    return {unit.name for unit in model.units}
 
 
 def _sliding(
@@ -170,8 +166,7 @@ def _sticking(
     """
     mine = [u for u in best.units if u.name == name and isinstance(u.effect, ServoDeadBand)]
     dry = [u for u in units if isinstance(u.effect, CoulombFriction) and u.where != "all"]
-    known = {u.name for u in best.units}
-    if not mine or known & {u.name for u in dry} or best.dispersion() < _MORE:
+    if not mine or best.names & {u.name for u in dry} or best.dispersion() < _MORE:
         return []
     more = {unit: unit.inside(_LITTLE * unit.high) for unit in dry}
     start = Point(best.fit.point.z, {**best.fit.point.strengths, **more})

@@ -121,9 +121,9 @@ def assemble(
     elif credit:
         first = max(credit, key=credit.__getitem__)
         rules = acting_regime(prepared, best.fit.point, first)
-        more += wavering_alarms(best, prepared.sets["train"].segments)
         if rules:
             where |= {"regimes": [asdict(rule) for rule in rules], "regimes_of": first}
+        more += wavering_alarms(best, prepared.sets["train"].segments)
     names, measured = {effect.name for effect in found.effects}, found.measured
     left = measured.effects if names else measured.refit
     seen = concluded(seen, verdict, names, left=left)

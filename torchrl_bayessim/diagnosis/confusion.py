@@ -54,7 +54,7 @@ def confusion_set(selection: Selection, name: str) -> tuple[str, ...]:
 
 def _alike_alone(selection: Selection, name: str) -> list[str]:
     """Return what acts like an effect and, alone, explains the data as well as it does alone."""
-    alone = [m for m in selection.tried if len({u.name for u in m.units}) == 1]
+    alone = [m for m in selection.tried if len(m.names) == 1]
     mine = [m for m in alone if m.units[0].name == name]
     if not mine:
         return []

@@ -48,10 +48,9 @@ def _apart(selection: Selection, sets: Mapping[str, Objective]) -> Selection:
     Effects that were added together may never have been fitted one by one.
     """
     best = selection.best
-    names = {unit.name for unit in best.units}
     known = [set(model.units) for model in selection.tried]
-    missing = [{u for u in best.units if u.name != name} not in known for name in names]
-    if len(names) < 2 or not any(missing):
+    missing = [{u for u in best.units if u.name != name} not in known for name in best.names]
+    if len(best.names) < 2 or not any(missing):
         return selection
     return replace(
         selection,

@@ -54,7 +54,7 @@ def _without_each(train: Objective, validation: Objective, model: Model) -> list
 
 def without_idle(train: Objective, validation: Objective, model: Model) -> Model:
     """Return a model without the places of an effect that next to nothing is due to."""
-    while len({unit.name for unit in model.units}) < len(model.units):
+    while len(model.names) < len(model.units):
         smaller = _without_each(train, validation, model)
         idle = _idle_place(model, smaller)
         if idle is None:
@@ -118,7 +118,7 @@ def without_stopgaps(
         model: To start from.
         offered: Units with effects as they were offered, of which no number has been fitted.
     """
-    while len({unit.name for unit in model.units}) > 1:
+    while len(model.names) > 1:
         smaller = [
             fitted
             for part in parts(train, validation, model, of=lambda left: bendable(train, left))

@@ -77,9 +77,8 @@ def _matters(
     alone, before, after = (m.mean_square for m in (start, base, better))
     removed = (before - after) / max(before - 1.0, 1e-9)
     # a third one mends the forms of two others more easily, and two at once more than one
-    known = {unit.name for unit in base.units}
-    count = max(len({unit.name for unit in better.units}) - len(known), 1)
-    several = count > 1 or len(known) > 1
+    count = max(len(better.names) - len(base.names), 1)
+    several = count > 1 or len(base.names) > 1
     rest = 1.0 - (1.0 - _REST) ** count
     if before - after > _SHARE * (alone - 1.0) and not (several and removed < rest):
         return True

@@ -82,9 +82,7 @@ class Evident:
         return np.flatnonzero(self.unit.direction).tolist()
 
 
-def evident(
-    suspects: Suspects, selection: Selection, found: Sequence[Chance] = ()
-) -> Evident | None:
+def evident(suspects: Suspects, selection: Selection, found: Sequence[Chance]) -> Evident | None:
     """Return the likeliest losses of commands, if segments are much likelier with any.
 
     Or those that were found in the place of effects that last.

@@ -93,7 +93,7 @@ def _needed(
     Judged with the commands as they were sent and all that may have been lost of them.
     """
     chance, sets = lost_beside(seen, selection.best), arrived.sets
-    while len({unit.name for unit in selection.best.units}) > 1:
+    while len(selection.best.names) > 1:
         smaller = parts(sets["train"], sets["validation"], selection.best)
         found = [(lost_beside(seen, model), model) for model in smaller]
         known = [(one.deviance, one, model) for one, model in found if one is not None]

@@ -52,6 +52,11 @@ class Model:
         """The effects in it."""
         return self.fit.units
 
+    @property
+    def names(self) -> set[str]:
+        """The names of the effects, each of which may be at several places."""
+        return {unit.name for unit in self.units}
+
     def beyond(self, base: Model) -> list[Unit]:
         """Return the effects that it has and ``base`` has not."""
         return [unit for unit in self.units if unit not in base.units]

@@ -147,14 +147,14 @@ class _Search:
         best = self.start
         for rounds in range(1, _MOST + 1):
             further = self._further(best)
-            if further is None or rounds == _MOST:
-                needs = self._needs(further or best)
-                fewer = len(_names(needs)) < len(_names(further or best))
-                best = needs
-                if not fewer or nothing_left(self.start, needs) or needs.mean_square < WHITE:
-                    break
-            else:
-                best = further
+            found = further or best
+            if further is not None and rounds < _MOST:
+                best = found
+                continue
+            best = self._needs(found)
+            enough = nothing_left(self.start, best) or best.mean_square < WHITE
+            if enough or len(best.names) == len(found.names):
+                break
         return best
 
     def _further(self, best: Model) -> Model | None:
@@ -198,10 +198,6 @@ class _Search:
         needs = without_stopgaps(*self.sets, needs, self.offered)
         self.tried += [*dropped, needs]
         return needs
-
-
-def _names(model: Model) -> set[str]:
-    return {unit.name for unit in model.units}
 
 
 def _worth(start: Model, train: Objective) -> Callable[..., bool]:

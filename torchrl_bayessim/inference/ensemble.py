@@ -9,7 +9,15 @@ best network on Acrobot, more than a fit is to take (``recipes/posterior_recover
 
 from __future__ import annotations
 
-__all__ = ["PosteriorMaker", "fit_apart", "fit_together", "learn", "pairs_of", "real_summaries"]
+__all__ = [
+    "NETWORKS",
+    "PosteriorMaker",
+    "fit_apart",
+    "fit_together",
+    "learn",
+    "pairs_of",
+    "real_summaries",
+]
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -29,6 +37,7 @@ from .priors import Prior
 from .usable_pairs import usable_pairs
 from .widening import average
 
+NETWORKS = 3  # of an average, unless others are asked for
 PosteriorMaker = Callable[[Prior, int], MixtureDensityPosterior]
 
 

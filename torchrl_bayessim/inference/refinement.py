@@ -24,7 +24,7 @@ from ..errors import message
 from ..kinds import check_function, check_kind
 from ..randomness import check_draw_key, seed_from
 from ..sources import Defensive, check_prior_share, draw
-from .ensemble import PosteriorMaker, learn, pairs_of, real_summaries
+from .ensemble import NETWORKS, PosteriorMaker, learn, pairs_of, real_summaries
 from .fit import FitReport, check_fit_options
 from .misspecification import doubts
 from .physics_posterior import PhysicsPosterior
@@ -74,7 +74,7 @@ class PosteriorRefinement:
         prior: Prior,
         *,
         simulations: int = 1024,
-        networks: int = 3,
+        networks: int = NETWORKS,
         make_posterior: PosteriorMaker | None = None,
         margin: float = 1.0,
         prior_share: float = 0.25,

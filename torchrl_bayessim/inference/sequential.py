@@ -22,7 +22,7 @@ from ..errors import SimulationError, message
 from ..kinds import check_choice, check_function
 from ..randomness import seed_from
 from ..sources import Defensive, check_prior_share, draw
-from .ensemble import learn, pairs_of, real_summaries
+from .ensemble import NETWORKS, learn, pairs_of, real_summaries
 from .fit import FitReport, check_fit_options
 from .misspecification import doubts
 from .physics_posterior import PhysicsPosterior
@@ -73,7 +73,7 @@ def sequential(
     simulations: int,
     correction: Correction | None = None,
     prior_share: float = 0.2,
-    networks: int = 3,
+    networks: int = NETWORKS,
     make_posterior: Callable[[int], MixtureDensityPosterior] | None = None,
     seed: int = 0,
     **fit_options: Any,
