@@ -9,10 +9,11 @@ def run(descent, function, most=50):
     calls = 0
     for _ in range(most):
         points = descent.ask()
-        if not points:
+        if descent.done:
             break
         calls += len(points)
-        descent.tell([function(point) for point in points])
+        if points:
+            descent.tell([function(point) for point in points])
     return calls
 
 
@@ -52,6 +53,17 @@ def test_a_step_from_a_known_origin_teaches_what_was_not_known():
     descent.tell([np.array([0.0, 6.0])])
     assert descent.jacobian == pytest.approx(np.diag([1.0, 3.0]))
     assert len(descent.ask()) == 1
+
+
+def test_it_does_not_ask_for_what_it_was_told():
+    start, slope = np.array([2.0, 1.0]), np.diag([1.0, 3.0])
+    known = start, slope @ start, slope
+    descent = LevenbergMarquardt(start, WIDE, size=0, origin=known, begun=True)
+    assert descent.ask() == []
+    assert not descent.done
+    assert descent.cost == 4.0 + 9.0
+    assert run(descent, lambda x: slope @ x) == 1
+    assert descent.vector == pytest.approx([0.0, 0.0], abs=3e-3)
 
 
 def test_derivatives_that_mislead_are_made_anew():

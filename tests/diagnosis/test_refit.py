@@ -48,6 +48,17 @@ def test_a_race_stops_what_is_far_behind_and_leaves_the_best_alone():
     assert second.units == (WRONG,)
 
 
+def test_a_fit_goes_on_from_another_without_evaluating_its_point_again():
+    once, twice = Bends(), Bends()
+    whole = refit(once, STARTS, iterations=2, renew=False)
+    first = refit(twice, STARTS, iterations=1, renew=False)
+    then = refit(twice, first, iterations=1, renew=False)
+    assert twice.evaluations[RIGHT] == once.evaluations[RIGHT]
+    assert then[0].point.strengths[RIGHT] == pytest.approx(
+        whole[0].point.strengths[RIGHT], abs=1e-3
+    )
+
+
 def test_a_known_cost_may_be_what_a_fit_is_behind():
     alone, raced = Bends(), Bends()
     refit(alone, STARTS[1:])

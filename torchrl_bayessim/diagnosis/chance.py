@@ -147,12 +147,15 @@ def detectable(train: Objective, selection: Selection, units: Sequence[Unit]) ->
     The mean squared innovation that it adds must reach what calls for an effect of chance.
     """
     data, z = _Data.of(train, selection.nominal.fit.point), selection.nominal.fit.point.z
-    result = {}
+    threshold, result = _WHITE - 1.0, {}
     for unit in units:  # one after the other, for memory's sake
-        levels = np.array(_LEVELS) * unit.high
-        points = [Point(z, {unit: float(level)}) for level in levels]
-        added = (data.draws(points, _FEW) ** 2).mean((1, 2, 3))
-        result[unit] = crossing(levels, added, _WHITE - 1.0)
+        levels, added = np.array(_LEVELS) * unit.high, np.zeros(0)
+        for some in (levels[:2], *levels[2:, None]):  # as far as it takes
+            points = [Point(z, {unit: float(level)}) for level in some]
+            added = np.r_[added, (data.draws(points, _FEW) ** 2).mean((1, 2, 3))]
+            if added[-1] >= threshold:
+                break
+        result[unit] = crossing(levels[: len(added)], added, threshold)
     return result
 
 

@@ -93,8 +93,7 @@ def explanations(train: Objective, now: Round) -> list[Fit]:
         return []
     tried = refit(now.thin, starts, origins=origins, iterations=0, renew=False)
     tried = _promising(tried) if bent(base) else sorted(tried, key=_promise)[:_PROMISING]
-    starts = [fit.point for fit in tried]
-    tried = refit(now.thin, starts, origins=tried, iterations=3, renew=False)
+    tried = refit(now.thin, tried, iterations=3, renew=False)
     everywhere = [
         point
         for fit in _fittest(tried, _SURVIVORS, there=base.units)
@@ -113,7 +112,7 @@ def explanations(train: Objective, now: Round) -> list[Fit]:
         known.append(now.seen.origin(base, on) if near else None)
     tried = refit(train, starts, origins=known, iterations=2, renew=False)
     best = _fittest(tried, _FINALISTS, there=base.units, alike=1)
-    return refit(train, [fit.point for fit in best], origins=best, race=np.inf)
+    return refit(train, best, race=np.inf)
 
 
 def _starts(now: Round) -> tuple[list[Point], list[Fit | None]]:

@@ -36,6 +36,7 @@ class LevenbergMarquardt:
         size: The first coordinates, which have a standard normal prior.
         origin: A point, ``r`` there and its Jacobian ``(m, n)``, from which the beginning is the
             first step; without it derivatives are made at the beginning.
+        begun: Whether the origin is where it begins, and ``r`` is known there.
         renew: Whether derivatives are made anew where the updated ones fail, and before it stops.
         width: Step of derivatives.
 
@@ -55,6 +56,7 @@ class LevenbergMarquardt:
         *,
         size: int,
         origin: tuple[Array, Array, Array] | None = None,
+        begun: bool = False,
         renew: bool = True,
         width: float = 0.01,
     ) -> None:
@@ -63,17 +65,17 @@ class LevenbergMarquardt:
         self._size, self._renew, self._width = size, renew, width
         self._damping, self._factors = _FULL, (1.0,)
         self._asked: list[Array] = []
-        self._origin = origin
+        self._origin, self._begun = origin, begun
         self._stage = "begin"
         self._fresh = self._settled = self._right = self.done = False
         self.cost = self.gain = np.inf
 
     def ask(self) -> list[Array]:
-        """Return points at which residuals are wanted, none where it is done."""
+        """Return points at which residuals are wanted, none where it is done or need not ask."""
         if self.done:
             self._asked = []
         elif self._stage == "begin":
-            self._asked = [self.vector] if self._origin is not None else self._around()
+            self._asked = self._first()
         elif self._stage == "renew":
             self._asked = self._around()[1:]
         else:
@@ -91,6 +93,15 @@ class LevenbergMarquardt:
             self._renewed(residuals)
         else:
             self._tried(residuals)
+
+    def _first(self) -> list[Array]:
+        """Return where to begin, with what derivatives take; nothing where both are known."""
+        if self._origin is None:
+            return self._around()
+        if not self._begun:
+            return [self.vector]
+        self._begin([self._origin[1]])
+        return []
 
     def _around(self) -> list[Array]:
         points = [self.vector]

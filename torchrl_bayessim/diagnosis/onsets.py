@@ -12,10 +12,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .objective import Objective, Point, Unit
 
+Index = NDArray[np.int64]
 _HALVINGS = 8
+_FIRST = 3  # segments that are looked at before the others
 _NOTHING = 1e-6  # standard deviations
 
 
@@ -31,23 +34,29 @@ def with_onsets(objective: Objective, point: Point, units: Sequence[Unit]) -> li
     if not limits:
         return list(units)
     before = objective([point])[0]
+    every = np.arange(len(before))
 
-    def acts(strengths: Sequence[float]) -> list[bool]:
-        points = [Point(point.z, {u: s}) for u, s in zip(limits, strengths, strict=True)]
-        return (np.abs(objective(points) - before).max((1, 2)) > _NOTHING).tolist()
+    def acting(unit: Unit, strength: float, some: Index) -> Index:
+        """Return in which of some segments a strength does anything, where it does most first."""
+        if not len(some):
+            return some
+        changed = objective.take(some)([Point(point.z, {unit: strength})])[0] - before[some]
+        size = np.abs(changed).max(1)
+        order = np.argsort(-size, kind="stable")
+        return some[order[size[order] > _NOTHING]]
 
-    ever = acts([unit.high for unit in limits])
-    low, high = [0.0] * len(limits), [unit.high for unit in limits]
-    for _ in range(_HALVINGS):
-        middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
-        for i, act in enumerate(acts(middle)):
-            if act:
-                high[i] = middle[i]
+    def onset(unit: Unit) -> float:
+        low, high, some = 0.0, unit.high, acting(unit, unit.high, every)
+        for _ in range(_HALVINGS if len(some) else 0):
+            middle = (low + high) / 2
+            # a wider limit acts nowhere else, and last where this one does most
+            if len(first := acting(unit, middle, some[:_FIRST])):
+                high, some = middle, np.r_[first, some[_FIRST:]]
+            elif len(others := acting(unit, middle, some[_FIRST:])):
+                high, some = middle, others
             else:
-                low[i] = middle[i]
-    found = {
-        unit: replace(unit, onset=onset)
-        for unit, onset, some in zip(limits, low, ever, strict=True)
-        if some
-    }
+                low = middle
+        return low
+
+    found = {unit: replace(unit, onset=onset(unit)) for unit in limits}
     return [found.get(unit, unit) for unit in units]

@@ -118,7 +118,7 @@ class Fit:
 
 def refit(
     objective: Objective,
-    starts: Sequence[Point],
+    starts: Sequence[Point] | Sequence[Fit],
     *,
     origins: Sequence[Fit | None] | None = None,
     iterations: int = 8,
@@ -129,7 +129,8 @@ def refit(
 
     Args:
         objective: What to make small.
-        starts: One per fit; the units in its strengths are the ones to fit.
+        starts: One per fit; the units in its strengths are the ones to fit. Earlier fits of the
+            objective go on as they are, with their derivatives.
         origins: For each start a point near it, with the same units, whose derivatives are known.
         iterations: Steps at most.
         renew: Whether derivatives are made anew where a step fails that they had promised, and
@@ -137,19 +138,21 @@ def refit(
         race: Stop fits that are far behind the best of them, or behind this cost, and do not
             catch up; infinite where no cost is known yet.
     """
-    models = [tuple(start.strengths) for start in starts]
+    begun = [isinstance(start, Fit) for start in starts]
+    known = [start if isinstance(start, Fit) else None for start in starts]
+    first = [start.point if isinstance(start, Fit) else start for start in starts]
+    models = [tuple(point.strengths) for point in first]
     descents = [
         LevenbergMarquardt(
-            _vector(start, units),
+            _vector(point, units),
             _bounds(objective, units),
             size=objective.size,
             origin=None if origin is None else _origin(origin, units),
+            begun=there,
             renew=renew,
             width=objective.width,
         )
-        for start, units, origin in zip(
-            starts, models, origins or [None] * len(starts), strict=True
-        )
+        for point, units, origin, there in zip(first, models, origins or known, begun, strict=True)
     ]
     for _ in range(1 + iterations):
         asked = [descent.ask() for descent in descents]
@@ -158,9 +161,9 @@ def refit(
             for units, vectors in zip(models, asked, strict=True)
             for vector in vectors
         ]
-        if not points:
+        if all(descent.done for descent in descents):
             break
-        residuals = iter(objective(points))
+        residuals = iter(objective(points) if points else ())
         for descent, vectors in zip(descents, asked, strict=True):
             if vectors:
                 descent.tell([next(residuals) for _ in vectors])
