@@ -14,11 +14,12 @@ from test_lost_values import TWO, run_of_two
 from torchrl_bayessim.diagnosis.arrivals import Arrivals
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.loss_law import LossLaw
-from torchrl_bayessim.diagnosis.losses import evident
-from torchrl_bayessim.diagnosis.lost_commands import _matters, beside_lost_commands
+from torchrl_bayessim.diagnosis.losses import _apart, evident
+from torchrl_bayessim.diagnosis.lost_commands import _matters, _searched, beside_lost_commands
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.preparation import prepare
 from torchrl_bayessim.effects.action import PacketDrop
+from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.logs.system import System
 
@@ -171,3 +172,43 @@ def test_beside_losses_that_were_found_alone_more_is_looked_for(monkeypatch, bes
     if seen is not None:
         assert seen.unit is unit
         assert seen.without == 100.0
+
+
+@pytest.mark.parametrize(
+    ("found", "last"),
+    [
+        ([(6.2, 4.3, A), (4.2, 1.8, A), (3.7, 1.5, A)], 1.5),  # better decisions each time
+        ([(6.2, 1.8, A), (4.2, 2.0, A)], 1.8),
+        ([(6.2, 4.3, A), (4.2, 4.0, A), (4.1, 3.9, A)], None),  # in the end it mends a little
+        ([(6.2, 6.2, None)], None),
+    ],
+)
+def test_which_commands_arrived_is_decided_on_again_while_that_helps(monkeypatch, found, last):
+    """Before and after the effects of each search; of 400 numbers."""
+    rounds = iter(found)
+
+    def search(_):
+        before, after, unit = next(rounds)
+        best = plain([] if unit is None else [unit], 400 * after)
+        return None, SimpleNamespace(nominal=plain([], 400 * before), best=best)
+
+    where = "torchrl_bayessim.diagnosis.lost_commands."
+    arrivals = SimpleNamespace(decided=lambda logs: logs)
+    monkeypatch.setattr(where + "Arrivals", lambda *_: arrivals)
+    monkeypatch.setattr(where + "with_other_commands", lambda *_, **__: None)
+    law = LossLaw(share=0.2, scatter=1.0, spoiled=0.01, size=16)
+    seen = SimpleNamespace(point=Point(np.zeros(1)), law=law, actuators=[0])
+    sent = SimpleNamespace(best=plain([], 400 * 100.0))
+    prepared = SimpleNamespace(logs={})
+    result = _searched(prepared, sent, seen, search=search, generator=np.random.default_rng(0))
+    assert (None if result is None else result[1].best.mean_square) == pytest.approx(last)
+    assert next(rounds, None) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "apart"),
+    [("dead_band", True), ("sensor_bias", True), ("sensor_drift", True), ("sensor_gain", False),
+     ("sensor_lag", False), ("action_delay", False)],
+)  # fmt: skip
+def test_losses_are_not_told_beside_what_errs_as_they_do(name, apart):
+    assert _apart(units_of([effect(name)], system().robot)) == apart

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..effects.action import PacketDrop
 from ..effects.contacts import ContactFriction
+from ..effects.sensors import SensorBias
 from .chance import Chance
 from .contacts import resting
 from .loss_law import LossLaw, Told, Tried, likeliest
@@ -175,11 +176,12 @@ def _apart(others: Sequence[Unit]) -> bool:
     """Return whether losses beside effects could not be another form of those.
 
     A lag that is not quite the true one, and contacts that stick and slip a little otherwise, err
-    as samples and commands would that were lost.
+    as samples and commands would that were lost; so do sensors, but by a constant or a slow drift.
     """
     known = [unit.effect for unit in others]
-    alike = any(e.group == "timing" or e.channel == "sensing" for e in known)
-    return not alike and not any(isinstance(e, ContactFriction) for e in known)
+    late = any(e.group == "timing" for e in known)
+    moving = any(e.channel == "sensing" and e.group != SensorBias.group for e in known)
+    return not late and not moving and not any(isinstance(e, ContactFriction) for e in known)
 
 
 def _all_found(

@@ -141,10 +141,11 @@ def _searched(
         logs = Arrivals(prepared, point, seen.actuators, law).decided(logs)
         again = with_other_commands(prepared, logs, generator=generator)
         again, selection = search(again)
-        if not _matters(selection) or selection.best.mean_square >= least:
+        if not selection.best.units or selection.best.mean_square >= least:
             break
-        least = selection.best.mean_square
-        result, point = (again, selection), selection.best.fit.point
+        least, point = selection.best.mean_square, selection.best.fit.point
+        if _matters(selection):  # or decisions in this simulator may be better ones
+            result = again, selection
         if least < WHITE:
             break
         law = replace(law, scatter=min(law.scatter, max(1.0, least)))
