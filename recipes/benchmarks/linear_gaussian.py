@@ -2,9 +2,9 @@ r"""A linear-Gaussian problem: how far is the learned posterior from the exact o
 
 :math:`x = A^T z + e` with two parameters, three statistics and noise of deviation 0.3; :math:`z` is
 normal, so that the posterior is a Gaussian, or uniform in a box, so that it is one cut off at the
-edges. The average of two networks with our defaults is fitted to simulated pairs; the figure is the
-Kullback-Leibler divergence :math:`KL(p \| q)` of the learned posterior q from the exact p, mean
-over 300 other observations, by draws from p. Prints one JSON line per prior::
+edges. The average of as many networks as by default, three, is fitted to simulated pairs; the
+figure is the Kullback-Leibler divergence :math:`KL(p \| q)` of the learned posterior q from the
+exact p, mean over 300 other observations, by draws from p. Prints one JSON line per prior::
 
     python recipes/benchmarks/linear_gaussian.py [seeds=3] [pairs=10000]
 """
@@ -19,7 +19,7 @@ from measuring import options, report
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_bayessim.inference.ensemble import fit_together
+from torchrl_bayessim.inference.ensemble import NETWORKS, fit_together
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior, Prior
 from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
@@ -76,7 +76,7 @@ def main(*arguments: str) -> None:
         found, seconds = [], []
         for seed in range(given["seeds"]):
             start = time.process_time()
-            own = (2 * seed, 2 * seed + 1)
+            own = range(NETWORKS * seed, NETWORKS * (seed + 1))
             networks = [MixtureDensityPosterior(prior, 3, seed=s) for s in own]
             pairs = simulated(prior, given["pairs"], seed=seed)
             fit_together(networks, pairs, seeds=own, progress=False)
