@@ -138,7 +138,6 @@ def refit(
         race: Stop fits that are far behind the best of them, or behind this cost, and do not
             catch up; infinite where no cost is known yet.
     """
-    begun = [isinstance(start, Fit) for start in starts]
     known = [start if isinstance(start, Fit) else None for start in starts]
     first = [start.point if isinstance(start, Fit) else start for start in starts]
     models = [tuple(point.strengths) for point in first]
@@ -148,11 +147,13 @@ def refit(
             _bounds(objective, units),
             size=objective.size,
             origin=None if origin is None else _origin(origin, units),
-            begun=there,
+            begun=earlier is not None,
             renew=renew,
             width=objective.width,
         )
-        for point, units, origin, there in zip(first, models, origins or known, begun, strict=True)
+        for point, units, earlier, origin in zip(
+            first, models, known, origins or known, strict=True
+        )
     ]
     for _ in range(1 + iterations):
         asked = [descent.ask() for descent in descents]
