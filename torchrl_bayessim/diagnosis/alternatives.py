@@ -65,8 +65,7 @@ def alternatives(
     """
     start = tried[0]
     result: dict[str, tuple[Model, ...]] = {}
-    names = list(dict.fromkeys(unit.name for unit in best.units))
-    for name in names:
+    for name in best.names:
         kept = {u: s for u, s in best.fit.point.strengths.items() if u.name != name}
         known = [m for m in tried if stands_in(m, kept, name)]
         if kept:

@@ -38,7 +38,7 @@ def confusion_set(selection: Selection, name: str) -> tuple[str, ...]:
     where the best law leaves more than noise: then neither is the true one, and a little more
     explained is no proof. The first name is the effect's own.
     """
-    own = {unit.name for unit in selection.best.units}
+    own = selection.best.names
     others = [stand_in(selection, rival) for rival in rivals(selection, name, form=_FORM)]
     if len(own) == 1 and min(selection.p_values[1:], default=1.0) < _MISSING:
         others += [

@@ -60,14 +60,14 @@ def _apart(selection: Selection, sets: Mapping[str, Objective]) -> Selection:
 
 def credit_of(selection: Selection) -> dict[str, float]:
     """Return each effect's share of the deviance that all of them remove, over all orders."""
-    names = list(dict.fromkeys(u.name for u in selection.best.units))
+    names = list(selection.best.names)
     full = float(selection.best.deviances().sum())
     none = float(selection.nominal.deviances().sum())
     if not names or none <= full:
         return dict.fromkeys(names, 0.0)
     known = {frozenset(names): full, frozenset[str](): none}
     for model in selection.tried:
-        inside = frozenset(u.name for u in model.units)
+        inside = frozenset(model.names)
         if inside and inside < frozenset(names) and set(model.units) <= set(selection.best.units):
             known[inside] = min(known.get(inside, np.inf), float(model.deviances().sum()))
 

@@ -16,7 +16,7 @@ __all__ = [
     "price",
 ]
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,9 +53,9 @@ class Model:
         return self.fit.units
 
     @property
-    def names(self) -> set[str]:
-        """The names of the effects, each of which may be at several places."""
-        return {unit.name for unit in self.units}
+    def names(self) -> Set[str]:
+        """The names of the effects, in their order; each may be at several places."""
+        return dict.fromkeys(unit.name for unit in self.units).keys()
 
     def beyond(self, base: Model) -> list[Unit]:
         """Return the effects that it has and ``base`` has not."""

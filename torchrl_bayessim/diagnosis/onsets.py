@@ -30,8 +30,7 @@ def with_onsets(objective: Objective, point: Point, units: Sequence[Unit]) -> li
         point: Parameters.
         units: The effects; those that are no limits, or never act, are returned as they are.
     """
-    limits = [unit for unit in units if unit.effect.limit]
-    if not limits:
+    if not any(unit.effect.limit for unit in units):
         return list(units)
     before = objective([point])[0]
     every = np.arange(len(before))
@@ -58,5 +57,4 @@ def with_onsets(objective: Objective, point: Point, units: Sequence[Unit]) -> li
                 low = middle
         return low
 
-    found = {unit: replace(unit, onset=onset(unit)) for unit in limits}
-    return [found.get(unit, unit) for unit in units]
+    return [replace(u, onset=onset(u)) if u.effect.limit else u for u in units]

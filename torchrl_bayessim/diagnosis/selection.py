@@ -70,7 +70,7 @@ class Selection:
         every, others = (*self.tried, *tried), {}
         least = float(best.deviances().sum()) - LIKELY
         fair = dict.fromkeys(m for m in every if float(m.deviances().sum()) > least)
-        for name in dict.fromkeys(unit.name for unit in best.units):
+        for name in best.names:
             kept = [unit for unit in best.units if unit.name != name]
             others[name] = tuple(m for m in fair if stands_in(m, kept, name))
         return replace(self, best=best, alternatives=others, tried=every)
