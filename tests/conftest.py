@@ -1,5 +1,6 @@
 """Shared fixtures: every test owns its randomness and leaves the global generators alone."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import settings
+from torchrl.envs.batched_envs import BatchedEnvBase
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 torch.set_num_threads(1)
@@ -16,9 +18,26 @@ settings.load_profile("shared")
 
 @pytest.fixture(autouse=True)
 def fixed_seed():
+    torch.set_num_threads(1)  # whatever the test before has closed
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_workers_are_left():
+    """Collect what a file leaves, and fail where that is still held open.
+
+    An environment that is collected in the midst of a test of another file closes itself then, and
+    torchrl raises the number of torch's threads as it does: from there on, numbers differ in their
+    last bits from those of the same seed.
+    """
+    yield
+    gc.collect()
+    batched = [e for e in gc.get_objects() if issubclass(type(e), BatchedEnvBase)]
+    left = [env for env in batched if not env.is_closed]
+    torch.set_num_threads(1)
+    assert not left
 
 
 @pytest.fixture
