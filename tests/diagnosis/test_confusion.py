@@ -112,6 +112,37 @@ def test_friction_one_way_and_half_of_it_as_a_push_is_friction_both_ways(monkeyp
         assert settled(found, name, sets).best is other
 
 
+def test_rivals_of_the_others_stand_beside_what_comes_to_the_front(monkeypatch):
+    old = pair(1.0, sensor_delay=0.02, com_shift=0.005)
+    front = pair(1.0, action_delay=0.02, com_shift=0.005)
+    rival = pair(1.0, sensor_delay=0.02, sensor_bias=0.02)
+    worse = pair(2.0, sensor_delay=0.02, payload=0.1)
+    found = replace(
+        selection(old), alternatives={"sensor_delay": (front,), "com_shift": (rival, worse)}
+    )
+    monkeypatch.setattr(confusion, "parts", lambda *_: [])
+    monkeypatch.setattr(confusion, "refit", lambda _, starts: starts)
+    fitted = lambda *_: [pair(1.0, **{u.name: s for u, s in p.strengths.items()}) for p in _[-1]]
+    monkeypatch.setattr(confusion, "judged", fitted)
+    found = settled(found, "sensor_delay", dict.fromkeys(("train", "validation")))
+    assert found.best is front
+    (beside,) = found.alternatives["com_shift"]
+    assert beside.names == {"action_delay", "sensor_bias"}
+    assert confusion_set(found, "com_shift") == ("com_shift", "sensor_bias")
+    assert confusion_set(found, "action_delay") == ("action_delay", "sensor_delay")
+
+
+def test_a_strength_more_that_explains_no_more_than_chance_does_not_come_to_the_front():
+    best = model(1.0, "action_delay")
+    more = replace(model(1.0, "sensor_delay"), validation=0.985 * best.validation)
+    units = (*more.units, *model(1.0, "sensor_lag").units)
+    point = Point(best.fit.point.z, dict.fromkeys(units, 0.02))
+    more = replace(more, fit=replace(more.fit, units=units, point=point))
+    found = selection(best, more)
+    sets = dict.fromkeys(("train", "validation"))
+    assert settled(found, "action_delay", sets).best is best
+
+
 @pytest.mark.parametrize(
     "instead",
     [

@@ -11,8 +11,9 @@ from ..effects.effect import Effect
 from ..effects.transmission import ServoDeadBand
 from .alternatives import kind, leaves_less_to_do
 from .elimination import parts, without_idle
-from .model import Model, as_good
-from .objective import Objective
+from .model import Model, as_good, criterion, judged
+from .objective import Objective, Point
+from .refit import refit
 from .selection import Selection
 
 _SAME = 2.0  # of a deviance: what fits of one and the same law may differ by
@@ -143,27 +144,43 @@ def stand_in(selection: Selection, rival: Model) -> str:
 def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> Selection:
     """Return the selection with that one of equals in front that explains most.
 
-    Of training and validation: test runs choose nothing. Of those that explain the same to the
-    last, such as late commands and late sensors, it is the one with fewer faults of sensors: it
-    needs no names of channels to be put on a simulator. And of equals that leave the other effects
-    more and less to make up for, the one that leaves less.
+    Of training and validation, with a price for each strength: test runs choose nothing. Of those
+    that explain the same to the last, such as late commands and late sensors, it is the one with
+    fewer faults of sensors: it needs no names of channels to be put on a simulator. And of equals
+    that leave the other effects more and less to make up for, the one that leaves less.
     """
     equals = [selection.best, *rivals(selection, name)]
-    deviances = {model: float(model.deviances().sum()) for model in equals}
-    least = min(deviances.values())
-    same = [model for model in equals if deviances[model] - least < _SAME]
-    first = min(same, key=lambda model: (_sensing(model), deviances[model]))
+    costs = {model: criterion(model, 1.0) for model in equals}
+    least = min(costs.values())
+    same = [model for model in equals if costs[model] - least < _SAME]
+    first = min(same, key=lambda model: (_sensing(model), costs[model]))
     plainer = [m for m in equals if leaves_less_to_do(first, m) and _sensing(m) <= _sensing(first)]
-    first = min(plainer, key=deviances.__getitem__, default=first)
+    first = min(plainer, key=costs.__getitem__, default=first)
     if first is selection.best:
         return selection
     chosen, first = first, without_idle(sets["train"], sets["validation"], first)
     others = tuple(m for m in (selection.best, *selection.alternatives[name]) if m is not chosen)
-    kept = {n: models for n, models in selection.alternatives.items() if n != name}
     tried = (*selection.tried, *parts(sets["train"], sets["validation"], first))
     return replace(
         selection,
         best=first,
         tried=tried,
-        alternatives={**kept, stand_in(selection, first): others},
+        alternatives={
+            **{n: _beside(first, selection, n, sets) for n in selection.best.names if n != name},
+            stand_in(selection, first): others,
+        },
     )
+
+
+def _beside(
+    first: Model, selection: Selection, name: str, sets: Mapping[str, Objective]
+) -> tuple[Model, ...]:
+    """Return the rivals of an effect beside another one in front: they stood beside the old one."""
+    new = {u: s for u, s in first.fit.point.strengths.items() if u.name != name}
+    starts = []
+    for rival in rivals(selection, name, form=_FORM):
+        added = {u: rival.fit.point.strengths[u] for u in rival.beyond(selection.best)}
+        starts.append(Point(rival.fit.point.z, {**new, **added}))
+    if not starts:
+        return ()
+    return tuple(judged(sets["train"], sets["validation"], refit(sets["train"], starts)))
