@@ -1,5 +1,6 @@
 import warnings
 
+import numpy as np
 import pytest
 import torch
 from torchrl.envs import Compose, TransformedEnv
@@ -68,6 +69,59 @@ def test_other_names_than_parameters_are_refused(posterior):
 def test_what_cannot_be_sampled_is_refused():
     with pytest.raises(TypeError, match="an sbi posterior with `sample`, got 'object'"):
         SbiSource(object(), names=["a"])
+
+
+class Constant:
+    """Stands for a posterior that gives the same draw again and again, of any kind."""
+
+    def __init__(self, row, kind=torch.tensor):
+        self.row, self.kind = row, kind
+
+    def sample(self, shape, x=None, show_progress_bars=True):
+        return self.kind([self.row] * shape[0])
+
+    def log_prob(self, value, x=None):
+        return self.kind([0.5] * len(value))
+
+
+def randomised(source):
+    physics = ApplyPhysics(AttributePhysics(*PRIOR.names))
+    return TransformedEnv(CartPoleEnv(4), Compose(physics, DomainRandomizer(source)))
+
+
+def test_draws_of_numpy_are_taken():
+    source = SbiSource(Constant([0.7, 1.5], np.array), names=PRIOR.names, prior=PRIOR)
+    found = draw(source, 3, key=(0,))
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, torch.tensor([[0.7, 1.5]]).expand(3, 2))
+    assert source.log_prob(found).tolist() == [0.5] * 3
+    env = randomised(source)
+    assert env.reset()["theta"].shape == (4, 2)
+
+
+def test_draws_that_are_no_numbers_are_refused():
+    source = SbiSource(Constant("a", list), names=["length"])
+    with pytest.raises(TypeError, match="draws of the 1 parameters length, numbers"):
+        source.sample(torch.Size([2]))
+
+
+def test_draws_outside_the_prior_are_refused():
+    source = SbiSource(Constant([-5.0, 1.5]), names=PRIOR.names, prior=PRIOR)
+    expected = r"inside the support of BoxPrior.*3 of 3 outside, the first \{'length': -5.0"
+    with pytest.raises(ValueError, match=expected):
+        draw(source, 3, key=(0,))
+    env = randomised(source)
+    with pytest.raises(ValueError, match="outside, the first"):
+        env.reset()
+    unbounded = SbiSource(Constant([-5.0, 1.5]), names=PRIOR.names)
+    assert draw(unbounded, 1, key=(0,)).tolist() == [[-5.0, 1.5]]
+
+
+def test_a_prior_that_does_not_fit_is_refused():
+    with pytest.raises(ValueError, match=r"a prior over \('length',\), got \('length', 'mass"):
+        SbiSource(Constant([1.0]), names=["length"], prior=PRIOR)
+    with pytest.raises(TypeError, match="a prior with names and contains, got 'Uniform'"):
+        SbiSource(Constant([1.0]), names=["a"], prior=torch.distributions.Uniform(0, 1))
 
 
 def test_sbi_is_not_imported_by_the_module():
