@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import chdir, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
@@ -21,15 +21,15 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_bayessim.inference.averaged_posterior import AveragedPosterior
 from torchrl_bayessim.inference.calibration import calibrate
 from torchrl_bayessim.inference.ensemble import fit_apart, fit_together
 from torchrl_bayessim.inference.fit import fit, select_lengthscale
 from torchrl_bayessim.inference.marginals import marginal_log_prob
 from torchrl_bayessim.inference.physics_posterior import PhysicsPosterior
-from torchrl_bayessim.inference.posterior import MixtureDensityPosterior, Pooling
+from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.inference.sequential import sequential
-from torchrl_bayessim.inference.widening import average
 from torchrl_bayessim.randomness import generator, isolated
 from torchrl_bayessim.sources import draw
 
@@ -62,46 +62,24 @@ Conditioned = Callable[[Tensor], PhysicsPosterior]
 """Summaries ``(R, L)`` of the real trajectories to the posterior."""
 
 
-class Networks:
-    """BayesSim's networks, fitted to the same pairs, and the average of their posteriors.
+def averaged(networks: AveragedPosterior, truth: Tensor, summary: Tensor, *, seed: int) -> Answer:
+    """Answer by the posterior of the mean summary."""
+    mean = summary.mean(1)
+    q = networks.distribution(mean)
+    test = TensorDict({"theta": truth, "summary": mean}, [len(truth)])
+    place = calibrate(networks, test, draws=DRAWS, seed=seed).rank
+    return Answer(marginal_log_prob(q, truth), place, q.log_prob(truth))
 
-    What one network got wrong is the same for all trajectories, and their product is too sure of
-    it. Several networks got different things wrong: their average is less sure.
-    """
 
-    def __init__(self, networks: Sequence[MixtureDensityPosterior]) -> None:
-        self.networks, self.prior = networks, networks[0].prior
-
-    def distribution(self, summary: Tensor) -> PhysicsPosterior:
-        """Return one posterior per summary."""
-        members = [network.distribution(summary).mixture for network in self.networks]
-        return PhysicsPosterior(average(members), self.prior)
-
-    def condition(self, summaries: Tensor, *, pooling: Pooling) -> PhysicsPosterior:
-        """Return the posterior given the summaries ``(R, L)`` of R real trajectories."""
-        members = [
-            network.condition(summaries, pooling=pooling, check=False).mixture
-            for network in self.networks
-        ]
-        return PhysicsPosterior(average(members), self.prior)
-
-    def averaged(self, truth: Tensor, summary: Tensor, *, seed: int) -> Answer:
-        """Answer by the posterior of the mean summary."""
-        mean = summary.mean(1)
-        q = self.distribution(mean)
-        test = TensorDict({"theta": truth, "summary": mean}, [len(truth)])
-        place = calibrate(self, test, draws=DRAWS, seed=seed).rank  # pyright: ignore
-        return Answer(marginal_log_prob(q, truth), place, q.log_prob(truth))
-
-    def pooled(self, truth: Tensor, summary: Tensor, *, seed: int) -> Answer:
-        """Answer by the posterior of all trajectories together."""
-        g = generator(seed, "pooled")
-        found = []
-        for own, several in zip(truth, summary, strict=True):
-            q = self.condition(several, pooling="product")
-            place = (q.sample((DRAWS,), generator=g) < own).float().mean(0)
-            found.append((marginal_log_prob(q, own), place, q.log_prob(own)))
-        return Answer(*(torch.stack(part) for part in zip(*found, strict=True)))
+def pooled(networks: AveragedPosterior, truth: Tensor, summary: Tensor, *, seed: int) -> Answer:
+    """Answer by the posterior of all trajectories together."""
+    g = generator(seed, "pooled")
+    found = []
+    for own, several in zip(truth, summary, strict=True):
+        q = networks.condition(several, check=False)
+        place = (q.sample((DRAWS,), generator=g) < own).float().mean(0)
+        found.append((marginal_log_prob(q, own), place, q.log_prob(own)))
+    return Answer(*(torch.stack(part) for part in zip(*found, strict=True)))
 
 
 def papers_bayessim(
@@ -129,8 +107,8 @@ def papers_bayessim(
     if features == "fourier":
         select_lengthscale(network, pairs, factors=(1, 2, 4), epochs=12, progress=False)
     fit(network, pairs, seed=seed, progress=False)
-    networks = Networks([network])
-    answer = torch.no_grad()(partial(networks.averaged, seed=seed))
+    networks = AveragedPosterior([network])
+    answer = torch.no_grad()(partial(averaged, networks, seed=seed))
     return answer, partial(networks.condition, pooling="mean")
 
 
@@ -142,11 +120,9 @@ def bayessim(
     seeds = range(networks * seed, networks * (seed + 1))
     fitted = [MixtureDensityPosterior(prior, x.shape[-1], seed=own) for own in seeds]
     (fit_apart if pool else fit_together)(fitted, pairs, seeds=seeds, progress=False)
-    together = Networks(fitted)
-    answer = together.pooled if pool else together.averaged
-    return torch.no_grad()(partial(answer, seed=seed)), partial(
-        together.condition, pooling="product"
-    )
+    together = AveragedPosterior(fitted)
+    answer = partial(pooled if pool else averaged, together, seed=seed)
+    return torch.no_grad()(answer), partial(together.condition, check=False)
 
 
 def rejection_abc(prior: BoxPrior, theta: Tensor, x: Tensor) -> Fitted:

@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -12,11 +14,11 @@ N, DRAWS = 600, 200
 NAMES = ("a", "b")
 
 
-def gaussian_problem(*, width=1.0, shift=0.0, ignore=False):
+def gaussian_problem(*, width=1.0, shift=0.0, ignore=False, count=N, some=DRAWS):
     """theta ~ N(0, 1), x = theta + N(0, 0.5^2): the posterior is known; here with an error."""
     g = generator("gaussian problem")
-    theta = torch.randn(N, 2, generator=g)
-    x = theta + 0.5 * torch.randn(N, 2, generator=g)
+    theta = torch.randn(count, 2, generator=g)
+    x = theta + 0.5 * torch.randn(count, 2, generator=g)
     precision = 1 + 4.0
     mean, sd = 4 * x / precision + shift, precision**-0.5
     if ignore:
@@ -24,7 +26,7 @@ def gaussian_problem(*, width=1.0, shift=0.0, ignore=False):
     posterior = torch.distributions.Normal(mean, width * sd)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        draws = posterior.sample((DRAWS,))
+        draws = posterior.sample((some,))
     log_prob = (posterior.log_prob(theta).sum(-1), posterior.log_prob(draws).sum(-1))
     return calibrate_draws(NAMES, theta, draws, log_prob=log_prob)
 
@@ -59,6 +61,47 @@ def test_a_biased_posterior_shows_in_the_ranks():
 def test_a_posterior_that_ignores_the_data_is_calibrated_all_the_same():
     """Which is why nats stand beside coverage."""
     assert gaussian_problem(ignore=True).passed
+
+
+@pytest.mark.parametrize("some", [2, 10, 50])
+def test_few_draws_do_not_make_the_exact_posterior_fail(some):
+    found = gaussian_problem(count=2000, some=some).p_values()
+    assert min(found.values()) > 1e-3, found
+
+
+@pytest.mark.parametrize("some", [2, 10, 50])
+@pytest.mark.parametrize("wrong", [{"width": 0.6}, {"shift": 0.4}], ids=["narrow", "shifted"])
+def test_few_draws_tell_a_wrong_posterior(some, wrong):
+    found = gaussian_problem(count=2000, some=some, **wrong)
+    assert found.p_values()["distance"] < 1e-3
+    assert not found.passed
+
+
+def test_an_exactly_flat_posterior_passes():
+    """All densities are equal: the truth's place among them is anyone's."""
+    theta, draws = torch.rand(N, 2), torch.rand(DRAWS, N, 2)
+    flat = (torch.zeros(N), torch.zeros(DRAWS, N))
+    found = calibrate_draws(NAMES, theta, draws, log_prob=flat)
+    assert found.passed, found.p_values()
+    assert found.coverage(0.5)["joint"] == pytest.approx(0.5, abs=0.07)
+
+
+def test_parameters_of_few_values_pass():
+    """Ties of ranks, densities and distances, in an exact posterior that takes three values."""
+    theta, draws = torch.randint(3, (N, 2)), torch.randint(3, (DRAWS, N, 2))
+    log_prob = (-theta.sum(-1).float(), -draws.sum(-1).float())
+    found = calibrate_draws(NAMES, theta, draws, log_prob=log_prob)
+    assert found.passed, found.p_values()
+
+
+def test_one_tie_is_shared_evenly():
+    """Of three draws one is below and two are equal: places 1 to 3 of 0 to 3, all as likely."""
+    theta, draws = torch.ones(4000, 1), torch.tensor([0.0, 1.0, 1.0]).reshape(3, 1, 1)
+    flat = (torch.zeros(4000), torch.zeros(3, 4000))
+    rank = calibrate_draws(("a",), theta, draws.expand(3, 4000, 1), log_prob=flat).rank
+    counts = (4 * rank).long().flatten().bincount(minlength=4)
+    assert counts[0] == 0
+    assert counts[1:].tolist() == pytest.approx([4000 / 3] * 3, abs=120)
 
 
 def test_the_band_is_the_binomial_s():
@@ -108,6 +151,56 @@ def test_the_same_seed_gives_the_same_shares():
     assert torch.equal(first.distance, again.distance)
     assert torch.equal(torch.random.get_rng_state(), before)
     assert first.rank.shape == (70, 2)
+
+
+@pytest.mark.parametrize(
+    ("summary", "theta"), [("observation", "physics"), (("sim", "x"), ("sim", "theta"))]
+)
+def test_a_network_of_other_keys_is_calibrated_by_them(summary, theta):
+    prior = BoxPrior({"a": (0.0, 1.0), "b": (-1.0, 1.0)})
+    pairs = linear_pairs(prior, 70, "test")
+    renamed = TensorDict(batch_size=[70])
+    renamed[summary], renamed[theta] = pairs["summary"], pairs["theta"]
+    network = MixtureDensityPosterior(prior, 2, in_key=summary, out_key=theta)
+    found = calibrate(network, renamed, draws=20)
+    same = calibrate(MixtureDensityPosterior(prior, 2), pairs, draws=20)
+    assert torch.equal(found.rank, same.rank)
+    assert torch.equal(found.density, same.density)
+
+
+def test_what_has_a_distribution_and_a_prior_alone_is_calibrated():
+    prior = BoxPrior({"a": (0.0, 1.0), "b": (-1.0, 1.0)})
+    network, pairs = MixtureDensityPosterior(prior, 2), linear_pairs(prior, 70, "test")
+    bare = SimpleNamespace(distribution=network.distribution, prior=prior)
+    found = calibrate(bare, pairs, draws=20)
+    assert torch.equal(found.rank, calibrate(network, pairs, draws=20).rank)
+
+
+@pytest.mark.parametrize("key", ["theta", "summary"])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_held_out_pairs_that_are_not_finite_are_refused(key, value):
+    prior = BoxPrior({"a": (0.0, 1.0), "b": (-1.0, 1.0)})
+    pairs = linear_pairs(prior, 70, "test")
+    pairs[key][3, 1] = value
+    with pytest.raises(ValueError, match=rf"finite held-out pairs, got .*'{key}' of 1 of 70"):
+        calibrate(MixtureDensityPosterior(prior, 2), pairs, draws=20)
+
+
+@pytest.mark.parametrize("key", ["theta", "summary"])
+def test_held_out_pairs_without_an_entry_are_refused(key):
+    prior = BoxPrior({"a": (0.0, 1.0), "b": (-1.0, 1.0)})
+    pairs = linear_pairs(prior, 70, "test").exclude(key)
+    (left,) = pairs.keys()
+    with pytest.raises(
+        ValueError, match=f"held-out pairs with an entry, got '{key}'. Available: {left}"
+    ):
+        calibrate(MixtureDensityPosterior(prior, 2), pairs, draws=20)
+
+
+def test_no_held_out_pairs_are_refused():
+    prior = BoxPrior({"a": (0.0, 1.0), "b": (-1.0, 1.0)})
+    with pytest.raises(ValueError, match="at least one held-out pair, got 'none'"):
+        calibrate(MixtureDensityPosterior(prior, 2), linear_pairs(prior, 70, "test")[:0])
 
 
 def test_draws_of_another_shape_are_refused():

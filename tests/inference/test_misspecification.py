@@ -108,6 +108,32 @@ def test_several_real_trajectories_are_counted():
     assert "1 of 3 real summaries" in doubt
 
 
+def test_many_right_trajectories_are_doubted_no_more_often_than_one():
+    alarms = 0
+    for _ in range(60):
+        simulated, observed = torch.randn(200, 4), torch.randn(40, 4)
+        alarms += len(doubts(simulated, observed, WITHIN))
+    assert alarms <= 2  # a fifth of the rows' sets have one among the furthest 0.7 %
+
+
+def test_what_no_parameter_explains_is_found_by_few_times_the_noise():
+    """Twelve statistics of four parameters: eight of their combinations never vary but by noise."""
+    effects = torch.randn(4, 12, generator=generator("effects"))
+    basis = torch.linalg.qr(effects.mT).Q
+    way = torch.randn(12, generator=generator("way"))
+    way = way - basis @ (basis.mT @ way)
+
+    def simulated(count):
+        return (2 * torch.rand(count, 4) - 1) @ effects + 0.02 * torch.randn(count, 12)
+
+    rows, robot = simulated(1000), simulated(1)[0] + 0.2 * way / way.norm()
+    share, deviation = strangeness(rows, robot)
+    assert share == pytest.approx(1 / 1001)
+    assert (deviation.abs() < 2).all()
+    (doubt,) = doubts(rows, robot, WITHIN)
+    assert "none is off by itself: their combination does not occur" in doubt
+
+
 def test_many_simulations_are_compared_with_in_part():
     share, _ = strangeness(torch.randn(50_000, 3), torch.full((3,), 20.0))
     assert share == pytest.approx(1 / 1001)

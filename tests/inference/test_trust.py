@@ -4,6 +4,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_bayessim.inference.averaged_posterior import AveragedPosterior
+from torchrl_bayessim.inference.ensemble import fit_together
 from torchrl_bayessim.inference.fit import fit
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior
@@ -81,3 +83,50 @@ def test_few_held_out_pairs_tell_nothing(network):
 def test_a_network_without_a_fit_is_refused():
     with pytest.raises(ValueError, match=r"a fitted network, got 'one that is not'\. Try: fit"):
         trust(MixtureDensityPosterior(PRIOR, 2), torch.zeros(2))
+
+
+def test_many_trajectories_that_are_right_are_believed_and_wrong_ones_are_not(network):
+    """However many there are: the mean of n is compared with means of n."""
+    right = simulate(torch.tensor([[0.4, 0.5]]).expand(10, 2), "ten")
+    assert trust(network, right, simulate=simulate).doubts == ()
+    for count in (3, 10):
+        wrong = right[:count] + torch.tensor([0.4, -0.4])
+        found = trust(network, wrong, simulate=simulate)
+        assert found.predictive == pytest.approx(1 / 201)
+        assert any("simulations at the posterior lie as far out" in text for text in found.doubts)
+
+
+def test_a_small_bias_of_every_trajectory_is_found_in_their_mean(network):
+    """Off by twice the noise each, which one alone may be; the product is sure of nonsense."""
+    right = simulate(torch.tensor([[0.4, 0.5]]).expand(16, 2), "sixteen")
+    off = right + torch.tensor([0.1, -0.1])
+    assert trust(network, off[:1], simulate=simulate).predictive > 0.01
+    assert trust(network, off, simulate=simulate).predictive < 0.01
+
+
+def test_several_networks_are_reported_on_together():
+    theta = PRIOR.sample((1000,), generator=generator(0))
+    networks = [MixtureDensityPosterior(PRIOR, 2, seed=seed) for seed in (0, 1)]
+    pairs = TensorDict({"theta": theta, "summary": simulate(theta)}, [1000])
+    fit_together(networks, pairs, seeds=(0, 1), epochs=20, progress=False)
+    found = trust(AveragedPosterior(networks), torch.tensor([0.4, 0.8]), simulate=simulate)
+    assert found.doubts == ()
+    assert found.unchecked == ()
+    assert len(found.calibration.rank) == 100
+    assert found.posterior.mixture.logits.numel() > networks[0].network.components
+
+
+def test_what_was_not_checked_is_said(network):
+    again = MixtureDensityPosterior(PRIOR, 2)
+    again.load_state_dict(network.state_dict())
+    said = str(trust(again, torch.tensor([0.4, 0.8])))
+    assert "No reason to doubt" in said
+    assert "Not checked: calibration, without 50 held-out pairs of equal weight." in said
+    assert "Not checked: whether simulations at the posterior give such data" in said
+
+
+def test_simulations_of_another_shape_or_too_few_are_refused(network):
+    with pytest.raises(ValueError, match=r"summaries of shape \(200, 2\) from simulate, got \(200"):
+        trust(network, torch.zeros(2), simulate=lambda theta: theta[:, :1])
+    with pytest.raises(ValueError, match="simulations"):
+        trust(network, torch.zeros(2), simulate=simulate, simulations=50)

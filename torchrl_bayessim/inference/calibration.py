@@ -9,10 +9,12 @@ then each of these shares of its draws is uniform on [0, 1]:
   region of level c in a share c of the cases: expected coverage (Hermans et al., 2022,
   arXiv:2110.06581);
 * **distance**: draws nearer to a random point than the truth is (TARP, Lemos et al., 2023,
-  arXiv:2302.03026). The points must depend on the data, or a posterior that ignores them passes;
-  here they are scattered around the posterior's mean.
+  arXiv:2302.03026). The points are scattered around truth and draws together: around the draws
+  alone, the truth would lie farther out than each of a few draws that are just as good.
 
-A posterior that is too sure has ranks at both ends and truths outside its regions.
+A posterior that is too sure has ranks at both ends and truths outside its regions. One that ignores
+the data and returns the prior passes, since nothing here sees the data: nats stand beside it
+(:mod:`.identifiability`).
 """
 
 from __future__ import annotations
@@ -24,11 +26,12 @@ from typing import Any
 
 import torch
 from scipy.stats import binom, kstest
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from ..errors import message
 from ..randomness import generator
+from .averaged_posterior import AveragedPosterior
 from .posterior import MixtureDensityPosterior
 
 _LEVEL = 0.01  # chance that a right posterior fails, over all tests together
@@ -138,42 +141,64 @@ def calibrate_draws(
         )
     theta, draws = theta.double(), draws.double()
     jitter = torch.rand(3, len(theta), 1, generator=generator(seed, "ties"), dtype=theta.dtype)
-
-    def share(below: Tensor, noise: Tensor) -> Tensor:
-        # among S draws the truth has S + 1 places; spread evenly within its own
-        return (below.double().sum(0) + noise) / (len(draws) + 1)
-
-    spread = torch.cat([theta, draws.flatten(0, 1)]).std(0).clamp_min(1e-12)
-    points = _reference(draws, generator(seed, "points"), spread)
-    away = ((draws - points) / spread).norm(dim=-1)
-    own = ((theta - points) / spread).norm(dim=-1)
+    own, away = _distances(theta, draws, generator(seed, "points"))
     at_truth, at_draws = log_prob
     return Calibration(
         names,
-        share(draws < theta, jitter[0]),
-        share(at_draws > at_truth, jitter[1, :, 0]),
-        share(away < own, jitter[2, :, 0]),
+        _share(draws, theta, jitter[0]),
+        _share(-at_draws, -at_truth, jitter[1, :, 0]),
+        _share(away, own, jitter[2, :, 0]),
     )
 
 
-def _reference(draws: Tensor, g: torch.Generator, spread: Tensor) -> Tensor:
-    """Return the posterior's means, pushed at random, shape ``(N, D)``."""
-    push = torch.randn(draws.shape[1:], generator=g, dtype=draws.dtype)
-    return draws.mean(0) + 0.5 * (draws.std(0) + 0.1 * spread) * push
+def _share(draws: Tensor, truth: Tensor, noise: Tensor) -> Tensor:
+    r"""Return the share of draws below the truth, at a random place among those equal to it.
+
+    .. math::
+        (\#\{d < t\} + U (\#\{d = t\} + 1)) / (S + 1), \quad U \sim U(0, 1)
+
+    Args:
+        draws: Shape ``(S, *)``.
+        truth: Shape ``(*)``.
+        noise: U, shape ``(*)``.
+    """
+    below, equal = (draws < truth).double().sum(0), (draws == truth).double().sum(0)
+    # among S draws the truth has S + 1 places; spread evenly over its own and its equals'
+    return (below + noise * (equal + 1)) / (len(draws) + 1)
+
+
+def _distances(theta: Tensor, draws: Tensor, g: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Return how far truths ``(N, D)`` and draws ``(S, N, D)`` are from points scattered near them.
+
+    Truth and draws enter the points alike, or few draws would be nearer than the truth is.
+    """
+    pooled = torch.cat([theta.unsqueeze(0), draws])
+    scale = pooled.flatten(0, 1).std(0).clamp_min(1e-12)
+    push = torch.randn(theta.shape, generator=g, dtype=theta.dtype)
+    points = pooled.mean(0) + 0.5 * (pooled.std(0) + 0.1 * scale) * push
+    away = ((pooled - points) / scale).norm(dim=-1)
+    return away[0], away[1:]
 
 
 @torch.no_grad()
 def calibrate(
-    posterior: MixtureDensityPosterior, pairs: TensorDictBase, *, draws: int = 300, seed: int = 0
+    posterior: MixtureDensityPosterior | AveragedPosterior,
+    pairs: TensorDictBase,
+    *,
+    draws: int = 300,
+    seed: int = 0,
 ) -> Calibration:
     """Return the calibration of an amortised posterior.
 
     Args:
-        posterior: The network.
-        pairs: ``{"theta", "summary"}`` from the prior that it was not trained on, batch size
-            ``(N,)``. A few hundred tell 90 % from 85 %.
+        posterior: The network, or the average of several.
+        pairs: From the prior, and not trained on, under the posterior's keys, batch size ``(N,)``.
+            A few hundred tell 90 % from 85 %.
         draws: Posterior draws per pair.
         seed: Same seed, same numbers.
+
+    Raises:
+        ValueError: There are no pairs, or an entry is missing or not finite.
 
     Example:
         >>> from tensordict import TensorDict
@@ -185,18 +210,35 @@ def calibrate(
         >>> sorted(calibrate(untrained, pairs).coverage(0.5))
         ['joint', 'mass']
     """
+    theta = _finite(pairs, posterior.theta_key)
+    summary = _finite(pairs, posterior.summary_key)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     for index, rows in enumerate(torch.arange(len(pairs)).split(_ROWS)):
-        q: Any = posterior.distribution(pairs["summary"][rows])
+        q: Any = posterior.distribution(summary[rows])
         some = q.sample((draws,), generator=generator(seed, "calibration", index))
-        found.append((some, q.log_prob(pairs["theta"][rows]), q.log_prob(some)))
+        found.append((some, q.log_prob(theta[rows]), q.log_prob(some)))
     drawn, at_truth, at_draws = (
         torch.cat(part, -1 if part[0].ndim < 3 else 1) for part in zip(*found, strict=True)
     )
     return calibrate_draws(
         posterior.prior.names,
-        pairs["theta"],
+        theta,
         drawn,
         log_prob=(at_truth, at_draws),
         seed=seed,
     )
+
+
+def _finite(pairs: TensorDictBase, key: NestedKey) -> Tensor:
+    """Return an entry of held-out pairs, if they have it and it is finite."""
+    value = pairs.get(key, None)
+    if value is None:
+        found = sorted(map(str, pairs.keys(include_nested=True)))
+        raise ValueError(message("held-out pairs with an entry", str(key), available=found))
+    if not len(pairs):
+        raise ValueError(message("at least one held-out pair", "none"))
+    bad = ~value.isfinite().reshape(len(value), -1).all(-1)
+    if bad.any():
+        got = f"NaN or infinity in {key!r} of {int(bad.sum())} of {len(bad)}"
+        raise ValueError(message("finite held-out pairs", got, hint="leave these out"))
+    return value

@@ -30,12 +30,12 @@ from torch import Tensor
 
 from ..errors import message
 from ..kinds import check_kind, real_numbers
+from .averaged_posterior import AveragedPosterior
 from .fit import FitReport, fit, fit_several
 from .physics_posterior import PhysicsPosterior
 from .posterior import MixtureDensityPosterior
 from .priors import Prior
 from .usable_pairs import usable_pairs
-from .widening import average
 
 NETWORKS = 3  # of an average, unless others are asked for
 PosteriorMaker = Callable[[Prior, int], MixtureDensityPosterior]
@@ -49,8 +49,8 @@ def learn(
     make_posterior: PosteriorMaker,
     seeds: Sequence[int],
     fit_options: Mapping[str, Any],
-) -> tuple[PhysicsPosterior, FitReport]:
-    """Return the posterior given ``observed``, and what the first fit did.
+) -> tuple[AveragedPosterior, PhysicsPosterior, FitReport]:
+    """Return the networks, the posterior given ``observed``, and what the first fit did.
 
     Args:
         pairs: ``{"theta", "summary"[, "weight"]}``, batch size ``[N]``.
@@ -68,8 +68,9 @@ def learn(
     together = len(observed) == 1 and not _alike(networks)
     fitted = fit_together if together else fit_apart
     reports = fitted(networks, pairs, seeds=seeds, **fit_options)
-    members = [network.condition(observed, check=False).mixture for network in networks]
-    return PhysicsPosterior(average(members), prior), replace(reports[0], dropped=dropped)
+    averaged = AveragedPosterior(networks)
+    posterior = averaged.condition(observed, check=False)
+    return averaged, posterior, replace(reports[0], dropped=dropped)
 
 
 def _made(

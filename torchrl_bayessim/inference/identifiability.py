@@ -8,7 +8,8 @@ prior's,
 
 0 if the data say nothing; each :math:`\log 2 = 0.69` nats halve the range that is left. Parameters
 that only act together (a mass times a length) have posteriors that are wide one by one and strongly
-correlated.
+correlated. Under a correlated prior, what the data say about one parameter they also say about
+those that go with it.
 """
 
 from __future__ import annotations
@@ -19,9 +20,12 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.distributions import Normal
 
-from ..sources import draw
-from .marginals import marginal_log_prob
+from ..counts import check_count
+from ..errors import message
+from ..randomness import generator
+from .marginals import log_volume, one_by_one, scaled_marginals, turn
 from .physics_posterior import PhysicsPosterior
 from .priors import BoxPrior, Prior
 
@@ -37,8 +41,10 @@ class Identifiability:
     Attributes:
         names: The parameters' names.
         nats: Information gained about each parameter, shape ``(D,)``.
-        narrowing: Posterior over prior standard deviation, shape ``(D,)``.
-        correlation: Of the posterior, shape ``(D, D)``.
+        narrowing: Posterior over prior standard deviation, of the logarithm of a logarithmic
+            parameter, shape ``(D,)``.
+        correlation: Of the posterior, of logarithms likewise, shape ``(D, D)``; 0 with a parameter
+            that is known to the last digit.
     """
 
     names: tuple[str, ...]
@@ -91,6 +97,10 @@ def identifiability(
             posterior's own prior is the smaller box that was simulated last.)
         draws: Posterior draws that the expectations are taken over.
 
+    Raises:
+        ValueError: ``posterior`` is several, or not finite, or ``prior`` is over other parameters
+            or has them in another order.
+
     Example:
         >>> from torchrl_bayessim.inference.priors import BoxPrior
         >>> from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
@@ -102,20 +112,54 @@ def identifiability(
         These data say nothing about length (0.00 nats over the prior).
     """
     prior = posterior.prior if prior is None else prior
-    theta = draw(posterior, draws, key=("identifiability",))
-    gained = marginal_log_prob(posterior, theta) - _prior_marginals(prior, theta)
-    # correlations where mixtures live, so that a logarithmic parameter's tail does not rule them
-    z = prior.standardize(theta.double())
-    correlation = torch.atleast_2d(torch.corrcoef(z.mT))
+    if prior.names != posterior.names:
+        expected = f"a prior over {posterior.names} in this order, as the posterior"
+        raise ValueError(message(expected, prior.names))
+    v, theta = _draws(posterior, draws)
+    density = scaled_marginals(posterior, v) - log_volume(posterior.prior, theta)
+    gained = density - _prior_marginals(prior, theta)
+    # as the prior scales them, so that a logarithmic parameter's tail does not rule correlations
+    scaling = one_by_one(prior)
+    u = torch.where(scaling.log, torch.where(scaling.log, theta, 1.0).log(), theta)
+    narrowing = u.std(0) / scaling.scale_tril.diagonal()
     return Identifiability(
-        prior.names, gained.mean(0).clamp_min(0.0), z.std(0).float(), correlation.float()
+        prior.names,
+        gained.mean(0).clamp_min(0.0).float(),
+        narrowing.float(),
+        _correlation(u).float(),
     )
+
+
+def _draws(posterior: PhysicsPosterior, count: int) -> tuple[Tensor, Tensor]:
+    """Return draws as scaled parameters and as parameters, float64, each of shape ``(N, D)``.
+
+    In float32 the draws of a narrow posterior would lie many of its deviations apart from it.
+    """
+    check_count("draws", count, least=2)
+    if posterior.batch_shape:
+        hint = "posterior.condition(summaries of the real trajectories)"
+        shape = tuple(posterior.batch_shape)
+        raise ValueError(message("one posterior, of batch shape ()", shape, hint=hint))
+    z = posterior.mixture.sample((count,), generator=generator("identifiability"))
+    v = z @ turn(posterior.prior).mT
+    if not v.isfinite().all():
+        raise ValueError(message("a posterior of finite draws", "NaN or infinity among them"))
+    return v, one_by_one(posterior.prior)._call(v)
+
+
+def _correlation(u: Tensor) -> Tensor:
+    """Return the correlation of draws ``(N, D)``, 0 with columns that vary by rounding alone."""
+    varies = u.std(0) > 16 * torch.finfo(u.dtype).eps * u.abs().amax(0)
+    both = varies & varies.unsqueeze(-1)
+    return torch.where(both, torch.atleast_2d(torch.corrcoef(u.mT)), torch.eye(len(both)))
 
 
 def _prior_marginals(prior: Prior, theta: Tensor) -> Tensor:
     """Return the log-density of each parameter under the prior, shape ``(N, D)``."""
     if isinstance(prior, BoxPrior):
-        ratio = torch.where(prior.log, (prior.high / prior.low).clamp_min(1e-30).log(), 1.0)
+        low, high = prior.low.double(), prior.high.double()
+        ratio = torch.where(prior.log, (high / low).clamp_min(1e-30).log(), 1.0)
         logarithmic = -(ratio.log() + torch.where(prior.log, theta, 1.0).log())
-        return torch.where(prior.log, logarithmic, -(prior.high - prior.low).log())
-    return torch.distributions.Normal(prior.mean, prior.stddev).log_prob(theta)
+        return torch.where(prior.log, logarithmic, -(high - low).log())
+    scaling = one_by_one(prior)
+    return Normal(scaling.mean, scaling.scale_tril.diagonal()).log_prob(theta)

@@ -24,6 +24,7 @@ from ..errors import message
 from ..kinds import check_function, check_kind
 from ..randomness import check_draw_key, seed_from
 from ..sources import Defensive, check_prior_share, draw
+from .averaged_posterior import AveragedPosterior
 from .ensemble import NETWORKS, PosteriorMaker, learn, pairs_of, real_summaries
 from .fit import FitReport, check_fit_options
 from .misspecification import doubts
@@ -53,6 +54,8 @@ class PosteriorRefinement:
 
     Attributes:
         posterior: The last posterior; ``None`` before the first refinement.
+        network: The networks that gave it, for :func:`.trust.trust` or other real data; ``None``
+            before the first refinement, and after a state was loaded.
 
     Raises:
         TypeError: The prior is none of :mod:`.priors`, or a count is no whole number.
@@ -96,6 +99,7 @@ class PosteriorRefinement:
         self.margin, self.prior_share, self.seed = margin, prior_share, seed
         self.fit_options = {} if fit_options is None else dict(fit_options)
         self.posterior: PhysicsPosterior | None = None
+        self.network: AveragedPosterior | None = None
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -171,7 +175,7 @@ class PosteriorRefinement:
         if proposal is not local:
             counted = [(proposal, len(theta))]
             pairs["weight"] = importance_weights(theta, self.prior, counted)
-        self.posterior, report = learn(
+        self.network, self.posterior, report = learn(
             pairs,
             local,
             observed,

@@ -138,7 +138,7 @@ def sequential(
             local, pairs = proposal, _inside(history, proposal)
         else:
             local, pairs = prior, _pairs(history, prior, weighted=correction != "analytic")
-        learned, report = learn(
+        _, learned, report = learn(
             pairs,
             local,
             observed,

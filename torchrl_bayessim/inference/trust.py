@@ -8,7 +8,7 @@ needs the simulator:
 * is the network calibrated on pairs that it was not trained on (:mod:`.calibration`);
 * what do the data say about each parameter (:mod:`.identifiability`);
 * would simulations at the posterior give the real summary: the share of them that lies at least as
-  far from the others as the real one does.
+  far from the others as the real one does; of n trajectories, the share of means of n.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ from torch import Tensor
 from ..counts import check_count
 from ..errors import message
 from ..kinds import check_function, check_kind
+from ..randomness import generator
 from ..sources import draw
+from .averaged_posterior import AveragedPosterior
 from .calibration import Calibration, calibrate
 from .ensemble import real_summaries
 from .identifiability import Identifiability, identifiability
@@ -45,9 +47,10 @@ class Trust:
         posterior: Given the real data.
         doubts: One sentence per reason not to believe it.
         identifiability: What the data say about each parameter.
-        calibration: On held-out pairs; ``None`` if there are fewer than 50.
+        calibration: Of answers for one trajectory, on held-out pairs; ``None`` without at least 50.
         predictive: Share of simulations at the posterior that lie at least as far out as the real
-            summary, the least over several; ``None`` without a simulator.
+            summary, or of means of n of them as far as the mean of n real ones; ``None`` without a
+            simulator.
     """
 
     posterior: PhysicsPosterior
@@ -56,13 +59,24 @@ class Trust:
     calibration: Calibration | None
     predictive: float | None
 
+    @property
+    def unchecked(self) -> tuple[str, ...]:
+        """What could not be looked at, in words."""
+        found = []
+        if self.calibration is None:
+            found.append(f"calibration, without {_FEWEST} held-out pairs of equal weight")
+        if self.predictive is None:
+            found.append("whether simulations at the posterior give such data, without simulate")
+        return tuple(found)
+
     def __str__(self) -> str:
         found = [f"Doubt: {text}" for text in self.doubts] or ["No reason to doubt this posterior."]
+        found += [f"Not checked: {text}." for text in self.unchecked]
         return "\n".join([*self.identifiability.sentences(), *found])
 
 
 def trust(
-    network: MixtureDensityPosterior,
+    network: MixtureDensityPosterior | AveragedPosterior,
     observed: Tensor,
     *,
     held_out: TensorDictBase | None = None,
@@ -70,20 +84,21 @@ def trust(
     simulations: int = 200,
     seed: int = 0,
 ) -> Trust:
-    """Condition a fitted network on real summaries, and report on the result.
+    """Condition a fitted network, or several, on real summaries, and report on the result.
 
     Args:
-        network: After :func:`.fit.fit`.
+        network: After :func:`.fit.fit`; or the average of several.
         observed: Real summaries, shape ``(n, L)`` or ``(L,)``.
-        held_out: Pairs that it was not trained on; by default those that chose its best epoch,
-            which flatter it a little; none if the fit had weights.
+        held_out: Pairs that it was not trained on; by default those that chose its best epoch and
+            its width, which flatter it; none if the fit had weights.
         simulate: Parameters ``(N, D)`` to summaries ``(N, L)``, for the posterior predictive check.
-        simulations: Of that check.
+        simulations: Of that check, at least 99.
         seed: Same seed, same report.
 
     Raises:
         TypeError: An argument is of another kind, or ``observed`` is no numbers.
-        ValueError: The network has not been fitted, or ``observed`` is not finite.
+        ValueError: The network has not been fitted, ``observed`` is not finite, or ``simulate``
+            does not give a summary like it for each simulation.
 
     Example:
         >>> from tensordict import TensorDict
@@ -97,8 +112,8 @@ def trust(
         >>> "nothing about colour" in str(trust(network, torch.tensor([4.0])))
         True
     """
-    check_kind("a MixtureDensityPosterior", network, MixtureDensityPosterior)
-    check_count("simulations", simulations)
+    check_kind("a MixtureDensityPosterior", network, MixtureDensityPosterior, AveragedPosterior)
+    check_count("simulations", simulations, least=round(1 / _SURPRISE) - 1)
     if simulate is not None:
         check_function("simulate, a function of parameters (N, D)", simulate)
     if held_out is not None:
@@ -116,14 +131,37 @@ def trust(
     predictive = None
     if simulate is not None:
         theta = draw(posterior, simulations, key=(seed, "predictive"))
-        predicted = simulate(theta)
-        predictive = min(strangeness(predicted, row)[0] for row in rows)
-        if predictive <= max(_SURPRISE, 1.5 / simulations) / len(rows):
+        predicted = _predicted(simulate, theta, rows)
+        predictive = _share_as_far(predicted, rows, seed=seed)
+        if predictive <= _SURPRISE:
             found.append(
                 f"only {predictive:.1%} of {simulations} simulations at the posterior lie as far "
                 "out as the real summary: they do not reproduce the data."
             )
     return Trust(posterior, tuple(found), identifiability(posterior), calibration, predictive)
+
+
+def _predicted(simulate: Callable[[Tensor], Tensor], theta: Tensor, rows: Tensor) -> Tensor:
+    predicted = simulate(theta)
+    shape = len(theta), rows.shape[-1]
+    if not isinstance(predicted, Tensor) or predicted.shape != shape:
+        got = tuple(predicted.shape) if isinstance(predicted, Tensor) else type(predicted).__name__
+        raise ValueError(message(f"summaries of shape {shape} from simulate", got))
+    return predicted.to(rows)
+
+
+def _share_as_far(predicted: Tensor, rows: Tensor, *, seed: int) -> float:
+    """Return how many simulations lie as far out as real rows do, by their means.
+
+    A product of n answers is n times as sure as each: the rows one by one may all be likely where
+    their mean is not. Means are of n simulations drawn at random, so as far out as n right rows.
+    """
+    predicted = predicted[predicted.isfinite().all(-1)]
+    if len(rows) > 1 and len(predicted):
+        g = generator(seed, "groups")
+        order = [torch.randint(len(predicted), (len(rows),), generator=g) for _ in predicted]
+        predicted = torch.stack([predicted[some].mean(0) for some in order])
+    return strangeness(predicted, rows.mean(0))[0]
 
 
 def _unweighted(pairs: TensorDictBase | None) -> TensorDictBase | None:

@@ -1,0 +1,102 @@
+"""Several networks that were fitted to the same pairs, and answer by the average of their answers.
+
+What one network got wrong another did not: their average is less sure where they disagree (deep
+ensembles, Lakshminarayanan, Pritzel & Blundell, 2017, arXiv:1612.01474).
+"""
+
+from __future__ import annotations
+
+__all__ = ["AveragedPosterior"]
+
+import warnings
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from ..errors import message
+from ..kinds import check_kind
+from .misspecification import doubts
+from .physics_posterior import PhysicsPosterior
+from .posterior import MixtureDensityPosterior, Pooling
+from .priors import Prior
+from .widening import average
+
+
+class AveragedPosterior:
+    r"""The average :math:`\frac{1}{M} \sum_m q_m(\theta \mid x)` of M networks.
+
+    Args:
+        networks: One or more, over one prior and of the same keys, fitted by
+            :func:`.ensemble.fit_together` or one by one.
+
+    Raises:
+        TypeError: One of them is of another kind.
+        ValueError: There is none, or they are of different priors or keys.
+
+    Example:
+        >>> from torchrl_bayessim.inference.ensemble import fit_together, pairs_of
+        >>> from torchrl_bayessim.inference.priors import BoxPrior
+        >>> prior = BoxPrior({"mass": (2.0, 6.0)})
+        >>> theta = prior.sample((600,))
+        >>> networks = [MixtureDensityPosterior(prior, 1, seed=seed) for seed in (0, 1)]
+        >>> reports = fit_together(networks, pairs_of(theta, theta), seeds=(0, 1), epochs=20,
+        ...                        progress=False)
+        >>> posterior = AveragedPosterior(networks).condition(torch.tensor([4.0]))
+        >>> abs(posterior.mean.item() - 4) < 0.2
+        True
+    """
+
+    def __init__(self, networks: Sequence[MixtureDensityPosterior]) -> None:
+        if not networks:
+            raise ValueError(message("one network or more", "none"))
+        for network in networks:
+            check_kind("a MixtureDensityPosterior", network, MixtureDensityPosterior)
+        first = networks[0]
+        for network in networks:
+            keys = network.summary_key, network.theta_key
+            same = network.prior.settings == first.prior.settings
+            if not same or keys != (first.summary_key, first.theta_key):
+                expected = f"networks over {first.prior!r}, all with the same keys"
+                raise ValueError(message(expected, f"one over {network.prior!r}, keys {keys}"))
+        self.networks = tuple(networks)
+        self.summary_key, self.theta_key = first.summary_key, first.theta_key
+
+    @property
+    def prior(self) -> Prior:
+        """What all of them are over."""
+        return self.networks[0].prior
+
+    @property
+    def seen(self) -> Tensor | None:
+        """Summaries that the first was fitted to; ``None`` before a fit."""
+        return self.networks[0].seen
+
+    @property
+    def held_out(self) -> TensorDictBase | None:
+        """Pairs that no network learned from; ``None`` where each held out others."""
+        first, *others = (network.held_out for network in self.networks)
+        if first is None or any(other is None for other in others):
+            return None
+        theta = [own.get(self.theta_key) for own in (first, *others) if own is not None]
+        return first if all(torch.equal(own, theta[0]) for own in theta) else None
+
+    def distribution(self, summary: Tensor) -> PhysicsPosterior:
+        """Return one posterior per summary, for summaries ``(*, L)``."""
+        members = [network.distribution(summary).mixture for network in self.networks]
+        return PhysicsPosterior(average(members), self.prior)
+
+    def condition(
+        self, summaries: Tensor, *, pooling: Pooling = "product", check: bool = True
+    ) -> PhysicsPosterior:
+        """Return the average of what :meth:`.MixtureDensityPosterior.condition` gives of each."""
+        members = [
+            network.condition(summaries, pooling=pooling, check=False).mixture
+            for network in self.networks
+        ]
+        found = PhysicsPosterior(average(members), self.prior)
+        if check and self.seen is not None:
+            for doubt in doubts(self.seen, torch.as_tensor(summaries).to(self.seen), found):
+                warnings.warn(doubt, stacklevel=2)
+        return found
