@@ -202,9 +202,9 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         piles up at an edge: see :mod:`.misspecification`.
 
         Args:
-            summaries: Shape ``(n, L)`` or ``(L,)``, of trajectories as long as those that the network
-                was fitted to: it knows how sure a summary of so many steps is, and of no others.
-                Of unequal lengths, fit it to summaries of all n together, as
+            summaries: Shape ``(n, L)`` or ``(L,)``, of trajectories as long as those that it was
+                fitted to: it knows how sure a summary of so many steps is, and of no others. Of
+                unequal lengths, fit it to summaries of all n together, as
                 :meth:`.SummaryStatistics.together` makes them and the loop does.
             pooling: ``"product"``: :math:`\prod_i q(\theta \mid x_i) / p(\theta)^{n-1}`, the
                 posterior of independent trajectories, so that more data sharpen it;
