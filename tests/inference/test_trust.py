@@ -104,6 +104,18 @@ def test_a_small_bias_of_every_trajectory_is_found_in_their_mean(network):
     assert trust(network, off, simulate=simulate).predictive < 0.01
 
 
+@pytest.mark.parametrize("count", [2, 20])
+def test_right_trajectories_are_a_surprise_as_rarely_as_was_promised(network, count):
+    alarms = 0
+    few = network.held_out[:1]  # of calibration nothing is asked here
+    for turn in range(20):
+        theta = PRIOR.sample((1,), generator=generator("robot", turn)).expand(count, 2)
+        real = simulate(theta, f"real {turn}")
+        told = trust(network, real, held_out=few, simulate=simulate, simulations=99, seed=turn)
+        alarms += told.predictive <= 0.01
+    assert alarms <= 2  # 0.2 expected, and the network is not exact
+
+
 def test_several_networks_are_reported_on_together():
     theta = PRIOR.sample((1000,), generator=generator(0))
     networks = [MixtureDensityPosterior(PRIOR, 2, seed=seed) for seed in (0, 1)]

@@ -153,14 +153,17 @@ def _predicted(simulate: Callable[[Tensor], Tensor], theta: Tensor, rows: Tensor
 def _share_as_far(predicted: Tensor, rows: Tensor, *, seed: int) -> float:
     """Return how many simulations lie as far out as real rows do, by their means.
 
-    A product of n answers is n times as sure as each: the rows one by one may all be likely where
-    their mean is not. Means are of n simulations drawn at random, so as far out as n right rows.
+    A product of n answers is as sure as n times as many data: the rows one by one may all be likely
+    where their mean is not. Means are of n simulations drawn at random (a bootstrap), and vary as
+    well by what the mean of so few simulations may be off.
     """
     predicted = predicted[predicted.isfinite().all(-1)]
-    if len(rows) > 1 and len(predicted):
+    count = len(predicted)
+    if len(rows) > 1 and count:
         g = generator(seed, "groups")
-        order = [torch.randint(len(predicted), (len(rows),), generator=g) for _ in predicted]
-        predicted = torch.stack([predicted[some].mean(0) for some in order])
+        some = lambda size: predicted[torch.randint(count, (size,), generator=g)].mean(0)
+        means = [some(len(rows)) + some(count) - predicted.mean(0) for _ in range(count)]
+        predicted = torch.stack(means)
     return strangeness(predicted, rows.mean(0))[0]
 
 
