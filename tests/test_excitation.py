@@ -7,15 +7,9 @@ from torchrl.envs import StepCounter, TransformedEnv
 
 from torchrl_bayessim.envs.classic_control.pendulum import PendulumEnv
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
-from torchrl_bayessim.excitation import (
-    Experiment,
-    between_knots,
-    excite,
-    expected_information,
-    information_bound,
-    replayed,
-)
+from torchrl_bayessim.excitation import Experiment, between_knots, excite, replayed
 from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
+from torchrl_bayessim.information import expected_information, information_bound
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
 from torchrl_bayessim.randomness import generator
 

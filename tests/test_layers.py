@@ -37,6 +37,7 @@ LAYERS = [
         "robots",
         "influence",
         "excitation",
+        "information",
         "diagnosis",
     },
     {"evidence", "overlapped"},

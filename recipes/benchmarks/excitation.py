@@ -23,14 +23,9 @@ import torch
 from measuring import options, report
 from torch import Tensor
 
-from torchrl_bayessim.excitation import (
-    Simulate,
-    between_knots,
-    excite,
-    expected_information,
-    replayed,
-)
+from torchrl_bayessim.excitation import between_knots, excite, replayed
 from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.information import Simulate, expected_information
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
 from torchrl_bayessim.randomness import generator
 
