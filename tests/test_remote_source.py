@@ -55,34 +55,42 @@ def collector(kind, policy, **more):
     return kind(envs, policy, frames_per_batch=160, total_frames=3200, **options, **more)
 
 
-def pushed_within(collector, batches):
-    """Push after the second batch; return θ before and in the last batch.
+def first_draws(workers):
+    """Return θ of the first resets: the second worker's environments are numbers 2 and 3."""
+    found = []
+    for worker in range(workers):
+        randomizer = DomainRandomizer(Around(0.2), first_environment=2 * worker)
+        env = TransformedEnv(SerialEnv(2, single), randomizer)
+        found.append(env.reset()["theta"].flatten())
+    return torch.cat(found)
+
+
+def pushed_within(collector, batches, *, first):
+    """Push once batches with all first draws have come; return θ before and in the last batch.
 
     As many batches as that, and more of workers that a busy machine lets wait.
     """
-    seen = []
+    seen, pushed = [], None
     for i, batch in enumerate(collector):
         seen.append(batch["theta"].reshape(-1).unique())
-        if i == 1:
+        if pushed is None and i > 0 and torch.isin(first, torch.cat(seen)).all():
             push_source(collector, Around(1.2), key=(0, "round", 1))
-        if i >= batches and not torch.isin(seen[-1], torch.cat(seen[:2])).any():
+            pushed = i + 1
+        if pushed and i >= batches and not torch.isin(seen[-1], torch.cat(seen[:pushed])).any():
             break
     collector.shutdown()
-    return torch.cat(seen[:2]).unique(), seen[-1]
+    return torch.cat(seen[:pushed]).unique(), seen[-1]
 
 
 def assert_push_arrives(kind, **more):
-    policy = carrying()
-    before, after = pushed_within(collector(kind, policy, **more), batches=6)
+    policy, first = carrying(), first_draws(1 if kind is Collector else 2)
+    made = collector(kind, policy, **more)
+    before, after = pushed_within(made, batches=6, first=first)
+    assert torch.isin(first, before).all()
     assert (before > 0.2).all()
     assert (before < 0.3).all()
     table = draw(Around(1.2), 64, key=(0, "round", 1, "pushed")).flatten()
     assert torch.isin(after, table).all()
-    assert torch.isin(make().reset()["theta"].flatten(), before).all()
-    if kind is not Collector:  # the second worker's environments are numbers 2 and 3
-        randomizer = DomainRandomizer(Around(0.2), first_environment=2)
-        env = TransformedEnv(SerialEnv(2, single), randomizer)
-        assert torch.isin(env.reset()["theta"].flatten(), before).all()
 
 
 @pytest.mark.parametrize("kind", [Collector, MultiSyncCollector, MultiAsyncCollector])
