@@ -1,5 +1,3 @@
-from types import SimpleNamespace
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -166,14 +164,6 @@ def test_a_network_of_other_keys_is_calibrated_by_them(summary, theta):
     same = calibrate(MixtureDensityPosterior(prior, 2), pairs, draws=20)
     assert torch.equal(found.rank, same.rank)
     assert torch.equal(found.density, same.density)
-
-
-def test_what_has_a_distribution_and_a_prior_alone_is_calibrated():
-    prior = BoxPrior({"a": (0.0, 1.0), "b": (-1.0, 1.0)})
-    network, pairs = MixtureDensityPosterior(prior, 2), linear_pairs(prior, 70, "test")
-    bare = SimpleNamespace(distribution=network.distribution, prior=prior)
-    found = calibrate(bare, pairs, draws=20)
-    assert torch.equal(found.rank, calibrate(network, pairs, draws=20).rank)
 
 
 @pytest.mark.parametrize("key", ["theta", "summary"])

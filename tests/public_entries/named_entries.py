@@ -76,7 +76,7 @@ ENTRIES = {
             "observed": torch.tensor([0.5]),
             "held_out": None,
             "simulate": None,
-            "simulations": 8,
+            "simulations": 99,
         },
         {
             "network": "object",

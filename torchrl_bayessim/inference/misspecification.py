@@ -68,7 +68,7 @@ def _far_out(summaries: Tensor, observed: Tensor) -> tuple[Tensor, Tensor]:
     """Return how far rows lie out, the observed one first, and its deviations from the medians."""
     simulated = summaries[summaries.isfinite().all(-1)][:_MOST].double()
     rows = _in_spreads(torch.cat([observed[None].double(), simulated]))
-    seen = torch.cat([rows, _in_spreads(_components(rows))], -1)
+    seen = torch.cat([rows, _components(rows)], -1)
     distance = torch.cdist(seen, seen, p=torch.inf).fill_diagonal_(torch.inf)
     nearest = distance.topk(min(_NEIGHBOURS, len(simulated)), largest=False).values
     return nearest.mean(-1), rows[0]
@@ -85,12 +85,13 @@ def _in_spreads(rows: Tensor) -> Tensor:
 
 
 def _components(rows: Tensor) -> Tensor:
-    """Return the principal components of rows, ``(N, C)``, but for those that are constant."""
+    """Return principal components in their spreads, ``(N, C)``, but for those that are constant."""
     low, high = rows.quantile(torch.tensor([0.25, 0.75], dtype=rows.dtype), 0)
     bounded = rows[:, high - low > 0.5].clamp(-_BOUND, _BOUND)  # where most agree, rounding rules
     bounded = bounded - bounded.mean(0)
     _, size, directions = torch.linalg.svd(bounded, full_matrices=False)
-    return bounded @ directions[size > _DEPENDENT * len(rows) ** 0.5].mT
+    found = bounded @ directions[size > _DEPENDENT * len(rows) ** 0.5].mT
+    return _in_spreads(found) if found.numel() else found
 
 
 def piled_up(posterior: PhysicsPosterior) -> list[tuple[str, str, float]]:
