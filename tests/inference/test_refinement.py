@@ -57,6 +57,10 @@ def test_refinements_close_in_on_the_truth_and_report_what_they_used(prior):
     assert gains[1] > 2.5  # 0.1 / sqrt(2) deviations of noise on two parameters: at most 3.3
     assert made.posterior.names == prior.names
     assert made.posterior.units == prior.units
+    told = made.trust.identifiability
+    assert told.names == prior.names
+    assert (told.nats > 1.2).all()  # over the prior, not over the box that was simulated last
+    torch.testing.assert_close(made.trust.posterior.mean, made.posterior.mean)
 
 
 def test_a_second_refinement_simulates_around_the_first_posterior():

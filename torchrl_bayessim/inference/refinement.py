@@ -33,6 +33,7 @@ from .posterior import MixtureDensityPosterior
 from .priors import BoxPrior, Prior, check_prior
 from .proposals import focus, importance_weights
 from .truncation import TruncatedGaussianMixture
+from .trust import Trust, trust
 
 
 class PosteriorRefinement:
@@ -54,8 +55,10 @@ class PosteriorRefinement:
 
     Attributes:
         posterior: The last posterior; ``None`` before the first refinement.
-        network: The networks that gave it, for :func:`.trust.trust` or other real data; ``None``
-            before the first refinement, and after a state was loaded.
+        network: The networks that gave it, for other real data; ``None`` before the first
+            refinement, and after a state was loaded.
+        trust: What is to be said of it without further simulations: what the data tell about each
+            parameter, calibration and doubts, see :mod:`.trust`; ``None`` as ``network`` is.
 
     Raises:
         TypeError: The prior is none of :mod:`.priors`, or a count is no whole number.
@@ -70,6 +73,8 @@ class PosteriorRefinement:
         ...     report = refinement.refine(lambda theta: theta, torch.tensor([0.5]), key=(turn,))
         >>> abs(refinement.posterior.mean.item() - 0.5) < 0.1
         True
+        >>> print(refinement.trust)
+        These data say much about a: ...
     """
 
     def __init__(
@@ -100,6 +105,7 @@ class PosteriorRefinement:
         self.fit_options = {} if fit_options is None else dict(fit_options)
         self.posterior: PhysicsPosterior | None = None
         self.network: AveragedPosterior | None = None
+        self.trust: Trust | None = None
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -183,6 +189,8 @@ class PosteriorRefinement:
             seeds=[seed_from(self.seed, *key, "fit", i) for i in range(self.networks)],
             fit_options={"progress": progress} | self.fit_options,
         )
+        own = seed_from(self.seed, *key, "trust")
+        self.trust = trust(self.network, observed, prior=self.prior, seed=own)
         for doubt in doubts(summary, observed, self.posterior):
             warnings.warn(doubt, stacklevel=2)
         return report
@@ -226,6 +234,7 @@ class PosteriorRefinement:
             if name not in state:
                 expected = f"the state of a refinement under {self.prior!r}, with {name!r}"
                 raise ValueError(message(expected, sorted(map(str, state))))
+        self.network = self.trust = None
         if not state:
             self.posterior = None
             return

@@ -34,6 +34,7 @@ from .identifiability import Identifiability, identifiability
 from .misspecification import doubts, strangeness
 from .physics_posterior import PhysicsPosterior
 from .posterior import MixtureDensityPosterior
+from .priors import Prior
 
 _FEWEST = 50  # pairs, below which shares say too little
 _SURPRISE = 0.01  # share below which the real data are a surprise to the posterior
@@ -79,6 +80,7 @@ def trust(
     network: MixtureDensityPosterior | AveragedPosterior,
     observed: Tensor,
     *,
+    prior: Prior | None = None,
     held_out: TensorDictBase | None = None,
     simulate: Callable[[Tensor], Tensor] | None = None,
     simulations: int = 200,
@@ -89,6 +91,7 @@ def trust(
     Args:
         network: After :func:`.fit.fit`; or the average of several.
         observed: Real summaries, shape ``(n, L)`` or ``(L,)``.
+        prior: What was believed before any data, if not what the network was fitted under.
         held_out: Pairs that it was not trained on; by default those that chose its best epoch and
             its width, which flatter it; none if the fit had weights.
         simulate: Parameters ``(N, D)`` to summaries ``(N, L)``, for the posterior predictive check.
@@ -138,7 +141,8 @@ def trust(
                 f"only {predictive:.1%} of {simulations} simulations at the posterior lie as far "
                 "out as the real summary: they do not reproduce the data."
             )
-    return Trust(posterior, tuple(found), identifiability(posterior), calibration, predictive)
+    told = identifiability(posterior, prior=prior)
+    return Trust(posterior, tuple(found), told, calibration, predictive)
 
 
 def _predicted(simulate: Callable[[Tensor], Tensor], theta: Tensor, rows: Tensor) -> Tensor:
