@@ -641,3 +641,11 @@ def test_nothing_at_all_and_nothing_that_moves():
         check([], system)
     at_rest = [times(r, factor_q=0.0, factor_v=0.0) for r in records]
     assert "constant_channel" in kinds(check(at_rest, system), "warning")
+
+
+def test_a_clock_that_goes_back_and_on_again_is_an_error_and_tells_no_speeds():
+    record = swinging(0)
+    record = replace(record, time=np.where(np.arange(len(record.time)) % 2, 0.1, 0.0))
+    found = check([record], System(task=known_task("InvertedPendulum-v5")))
+    assert "repeated_time" in kinds(found, "error")
+    assert not {"velocity_scale", "velocity_mismatch"} & kinds(found, "error")
