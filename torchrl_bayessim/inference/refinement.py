@@ -33,7 +33,7 @@ from .posterior import MixtureDensityPosterior
 from .priors import BoxPrior, Prior, check_prior
 from .proposals import focus, importance_weights
 from .truncation import TruncatedGaussianMixture
-from .trust import Trust, trust
+from .trust import Trust, reported
 
 
 class PosteriorRefinement:
@@ -189,10 +189,11 @@ class PosteriorRefinement:
             seeds=[seed_from(self.seed, *key, "fit", i) for i in range(self.networks)],
             fit_options={"progress": progress} | self.fit_options,
         )
-        own = seed_from(self.seed, *key, "trust")
-        self.trust = trust(self.network, observed, prior=self.prior, seed=own)
-        for doubt in doubts(summary, observed, self.posterior):
+        found = doubts(summary, observed, self.posterior)
+        for doubt in found:
             warnings.warn(doubt, stacklevel=2)
+        own = seed_from(self.seed, *key, "trust")
+        self.trust = reported(self.network, self.posterior, found, prior=self.prior, seed=own)
         return report
 
     def _proposal(self) -> tuple[Prior, Any]:

@@ -13,10 +13,10 @@ needs the simulator:
 
 from __future__ import annotations
 
-__all__ = ["Trust", "trust"]
+__all__ = ["Trust", "reported", "trust"]
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from tensordict import TensorDictBase
@@ -126,23 +126,46 @@ def trust(
     rows = torch.atleast_2d(real_summaries(observed))
     posterior = network.condition(rows, check=False)
     found = doubts(network.seen, rows, posterior)
+    told = reported(network, posterior, found, prior=prior, held_out=held_out, seed=seed)
+    if simulate is None:
+        return told
+    theta = draw(posterior, simulations, key=(seed, "predictive"))
+    predictive = _share_as_far(_predicted(simulate, theta, rows), rows, seed=seed)
+    if predictive <= _SURPRISE:
+        surprise = (
+            f"only {predictive:.1%} of {simulations} simulations at the posterior lie as far "
+            "out as the real summary: they do not reproduce the data."
+        )
+        told = replace(told, doubts=(*told.doubts, surprise))
+    return replace(told, predictive=predictive)
+
+
+def reported(
+    network: MixtureDensityPosterior | AveragedPosterior,
+    posterior: PhysicsPosterior,
+    found: Sequence[str],
+    *,
+    prior: Prior | None = None,
+    held_out: TensorDictBase | None = None,
+    seed: int = 0,
+) -> Trust:
+    """Return the report on what a network was conditioned to, without simulations.
+
+    Args:
+        network: As of :func:`trust`.
+        posterior: Given the real data.
+        found: Doubts of :func:`.misspecification.doubts`.
+        prior: As of :func:`trust`.
+        held_out: As of :func:`trust`.
+        seed: Of the calibration.
+    """
     pairs = _unweighted(network.held_out) if held_out is None else held_out
     calibration = None
     if pairs is not None and len(pairs) >= _FEWEST:
         calibration = calibrate(network, pairs, seed=seed)
-        found += calibration.doubts()
-    predictive = None
-    if simulate is not None:
-        theta = draw(posterior, simulations, key=(seed, "predictive"))
-        predicted = _predicted(simulate, theta, rows)
-        predictive = _share_as_far(predicted, rows, seed=seed)
-        if predictive <= _SURPRISE:
-            found.append(
-                f"only {predictive:.1%} of {simulations} simulations at the posterior lie as far "
-                "out as the real summary: they do not reproduce the data."
-            )
+        found = [*found, *calibration.doubts()]
     told = identifiability(posterior, prior=prior)
-    return Trust(posterior, tuple(found), told, calibration, predictive)
+    return Trust(posterior, tuple(found), told, calibration, predictive=None)
 
 
 def _predicted(simulate: Callable[[Tensor], Tensor], theta: Tensor, rows: Tensor) -> Tensor:
@@ -166,7 +189,8 @@ def _share_as_far(predicted: Tensor, rows: Tensor, *, seed: int) -> float:
     if len(rows) > 1 and count:
         g = generator(seed, "groups")
         some = lambda size: predicted[torch.randint(count, (size,), generator=g)].mean(0)
-        means = [some(len(rows)) + some(count) - predicted.mean(0) for _ in range(count)]
+        mean = predicted.mean(0)
+        means = [some(len(rows)) + some(count) - mean for _ in range(count)]
         predicted = torch.stack(means)
     return strangeness(predicted, rows.mean(0))[0]
 
