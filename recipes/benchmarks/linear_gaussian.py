@@ -19,11 +19,11 @@ from measuring import options, report
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_bayessim.inference.averaged_posterior import AveragedPosterior
 from torchrl_bayessim.inference.ensemble import NETWORKS, fit_together
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior, Prior
 from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
-from torchrl_bayessim.inference.widening import average
 from torchrl_bayessim.randomness import generator
 
 SENSITIVITY = torch.tensor([[1.0, 0.5, 0.0], [-0.3, 0.8, 0.6]])  # A, of standardised parameters
@@ -63,7 +63,7 @@ def divergence(prior: Prior, networks: list[MixtureDensityPosterior], *, seed: i
     """Return the mean divergence of the networks' average from the exact posterior, in nats."""
     summary = simulated(prior, OBSERVATIONS, seed=seed)["summary"]
     p = exact(prior, summary)
-    q = average([network.distribution(summary).mixture for network in networks])
+    q = AveragedPosterior(networks).distribution(summary).mixture
     z = p.sample((DRAWS,), generator=generator(seed, "draws"))
     return (p.log_prob(z) - q.log_prob(z)).mean().item()
 
