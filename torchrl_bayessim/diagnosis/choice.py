@@ -67,7 +67,11 @@ def fewest(
         smaller = chosen(base, singles)
         # a screen of the base says nothing of what is beside the smaller one
         if smaller is not None and not worth(smaller, better, models, seen=None):
-            return better if _no_simpler(sets, smaller, better, offered) else smaller
+            if _no_simpler(sets, smaller, better, offered):
+                return better
+            # a law that was bent to make up for the new effect lets its rivals do as well
+            white = smaller.mean_square < WHITE
+            return smaller if white else with_fitted_forms(*sets, smaller, offered)
     elif better.mean_square < WHITE:
         return better
     fitted = _in_other_forms(sets, base, singles, offered)
