@@ -7,6 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_bayessim.inference.averaged_posterior import AveragedPosterior
 from torchrl_bayessim.inference.ensemble import fit_together
 from torchrl_bayessim.inference.fit import fit
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
@@ -53,14 +54,60 @@ def test_a_network_alone_is_never_made_surer():
     assert widen([sure(2 * DEVIATION)], held_out()).item() == 1.0
 
 
-def test_an_average_of_networks_that_disagree_is_made_surer():
+@pytest.mark.parametrize("deviation", [0.5, 1.0])
+def test_an_average_of_networks_that_disagree_is_as_wide_as_held_out_pairs_like(deviation):
     """Of +-d, each with deviation s, the mixture's variance is s^2 + d^2: too much for s alone."""
     apart = DEVIATION / 2**0.5
-    networks = [sure(DEVIATION, at) for at in (-apart, apart)]
-    factor = widen(networks, held_out())
-    assert 0.7 < factor.item() < 0.8  # the variance is met at 0.71
+    networks = [sure(deviation * DEVIATION, at) for at in (-apart, apart)]
+    widen(networks, held_out())
+    first, second = (network.network for network in networks)
+    assert torch.equal(first.widening, second.widening)
+    assert torch.equal(first.apart, second.apart)
+    assert first.apart.item() < 0.9
+    q = AveragedPosterior(networks).distribution(torch.zeros(1))
+    assert q.stddev.item() == pytest.approx(DEVIATION, rel=0.03)
+    theta = held_out()["theta"]
+    for share in (0.5, 0.9):
+        draws = q.sample((20_000,), generator=generator("draws")).abs().quantile(share)
+        assert (theta.abs() < draws).float().mean().item() == pytest.approx(share, abs=0.02)
+
+
+def test_networks_whose_truths_lie_where_one_of_them_does_stay_apart():
+    """Two modes, of which each network knows one: between them lies nothing."""
+    networks = [sure(DEVIATION, at) for at in (-1.0, 1.0)]
+    pairs = held_out()
+    pairs["theta"][::2] += 1.0
+    pairs["theta"][1::2] -= 1.0
+    widen(networks, pairs)
     for network in networks:
-        torch.testing.assert_close(network.network.widening, factor.float())
+        assert network.network.apart.item() == pytest.approx(1.0, abs=0.02)
+        assert network.network.widening.item() == pytest.approx(1.0, abs=0.05)
+
+
+def test_answers_that_are_multiplied_are_averaged_as_they_are():
+    networks = [sure(DEVIATION, at) for at in (-0.1, 0.1)]
+    for network in networks:
+        network.network.apart.fill_(0.0)
+    averaged, x = AveragedPosterior(networks), torch.zeros(2, 1)
+    one, several = (averaged.condition(some, check=False).mixture.loc for some in (x[:1], x))
+    assert one.flatten().tolist() == pytest.approx([0.0, 0.0])
+    assert several[0] < 0 < several[1]
+    mean = averaged.condition(x, pooling="mean", check=False).mixture.loc
+    torch.testing.assert_close(mean, one)
+    networks[1].network.apart.fill_(1.0)  # fitted one by one
+    assert averaged.condition(x[0], check=False).mixture.loc[0] < 0
+
+
+def test_a_state_brings_how_far_networks_stay_apart_and_a_fit_begins_with_all_of_it():
+    network, again = sure(DEVIATION), sure(DEVIATION)
+    network.network.apart.fill_(0.3)
+    again.load_state_dict(network.state_dict())
+    assert again.network.apart.item() == pytest.approx(0.3)
+    before = {k: v for k, v in network.state_dict().items() if not k.endswith("apart")}
+    sure(DEVIATION).load_state_dict(before)  # of a network saved before there was such a share
+    pairs = held_out(100)
+    fit(again, pairs.set("summary", pairs["theta"]), epochs=1, progress=False)
+    assert again.network.apart.item() == 1.0
 
 
 def test_each_parameter_gets_the_factor_that_it_lacks():

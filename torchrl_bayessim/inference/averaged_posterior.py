@@ -27,6 +27,10 @@ from .widening import average
 class AveragedPosterior:
     r"""The average :math:`\frac{1}{M} \sum_m q_m(\theta \mid x)` of M networks.
 
+    Where they were fitted together their means lie as far apart as held-out pairs like best: see
+    :mod:`.widening`. Answers that were multiplied, over several trajectories, are averaged as they
+    are, since those pairs say nothing of products.
+
     Args:
         networks: One or more, over one prior and of the same keys, fitted by
             :func:`.ensemble.fit_together` or one by one.
@@ -82,10 +86,16 @@ class AveragedPosterior:
         theta = [own.get(self.theta_key) for own in (first, *others) if own is not None]
         return first if all(torch.equal(own, theta[0]) for own in theta) else None
 
+    @property
+    def _apart(self) -> Tensor | None:
+        """The share that networks fitted together have in common."""
+        first, *others = (network.network.apart for network in self.networks)
+        return first if all(torch.equal(other, first) for other in others) else None
+
     def distribution(self, summary: Tensor) -> PhysicsPosterior:
         """Return one posterior per summary, for summaries ``(*, L)``."""
         members = [network.distribution(summary).mixture for network in self.networks]
-        return PhysicsPosterior(average(members), self.prior)
+        return PhysicsPosterior(average(members, self._apart), self.prior)
 
     def condition(
         self, summaries: Tensor, *, pooling: Pooling = "product", check: bool = True
@@ -95,7 +105,10 @@ class AveragedPosterior:
             network.condition(summaries, pooling=pooling, check=False).mixture
             for network in self.networks
         ]
-        found = PhysicsPosterior(average(members), self.prior)
+        multiplied = (
+            pooling == "product" and torch.atleast_2d(torch.as_tensor(summaries)).shape[0] > 1
+        )
+        found = PhysicsPosterior(average(members, None if multiplied else self._apart), self.prior)
         if check and self.seen is not None:
             for doubt in doubts(self.seen, torch.as_tensor(summaries).to(self.seen), found):
                 warnings.warn(doubt, stacklevel=2)

@@ -59,6 +59,7 @@ class MixtureDensityNetwork(nn.Module):
     widening: Tensor  # factor on each parameter's deviations that a fit ends with, shape (D,)
     contrast: Tensor  # power to which they are raised before that, shape (D,)
     tails: Tensor  # logarithm of the ratio of :func:`heavy_tailed`, shape (1,), or (0,) for none
+    apart: Tensor  # share of its distance from the mean of an average that is left there, (D,)
 
     def __init__(
         self,
@@ -94,6 +95,7 @@ class MixtureDensityNetwork(nn.Module):
         self.register_buffer("widening", torch.ones(parameters))
         self.register_buffer("contrast", torch.ones(parameters))
         self.register_buffer("tails", torch.zeros(0))
+        self.register_buffer("apart", torch.ones(parameters))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         widening = state_dict.get(f"{prefix}widening")
@@ -101,16 +103,18 @@ class MixtureDensityNetwork(nn.Module):
             if not widening.ndim:  # of before: one factor for all parameters
                 widening = state_dict[f"{prefix}widening"] = widening.expand_as(self.widening)
             # of before: none
-            state_dict.setdefault(f"{prefix}contrast", torch.ones_like(widening))
+            for name in ("contrast", "apart"):
+                state_dict.setdefault(f"{prefix}{name}", torch.ones_like(widening))
             tails = state_dict.setdefault(f"{prefix}tails", widening.new_zeros(0))
             self.tails = self.tails.new_zeros(len(tails))
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take a pickled network; those of before have no contrast, or no tails."""
+        """Take a pickled network; those of before have no contrast, no tails, or no share."""
         super().__setstate__(state)
-        if "contrast" not in self._buffers:
-            self.register_buffer("contrast", torch.ones_like(self.widening))
+        for name in ("contrast", "apart"):
+            if name not in self._buffers:
+                self.register_buffer(name, torch.ones_like(self.widening))
         if "tails" not in self._buffers:
             self.register_buffer("tails", self.widening.new_zeros(0))
 

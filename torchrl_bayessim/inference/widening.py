@@ -9,14 +9,20 @@ for an average, :math:`\sigma \to f_d\, m_d (\sigma / m_d)^{c_d}` with :math:`m_
 mean. And as it is right for some pairs and off for others, its errors have heavier tails than its
 components: it learns how much heavier, a ratio r of :func:`.network.heavy_tailed`.
 
-Factors, powers and the ratio maximise
+Networks that err apart have an average of means, :math:`\bar\mu`, that errs less than each of
+them; but the average of their answers is as wide as they lie apart, and the truth too often in its
+middle. So an average learns, too, which share :math:`a_d` of the way from :math:`\bar\mu` to each
+network's mean is left: :math:`\mu_m \to \bar\mu + a (\mu_m - \bar\mu)`. At 0 they have one mean.
+
+Factors, powers, the ratio and shares maximise
 
 .. math::
-    \sum_i \log q_{f, c, r}(\theta_i \mid x_i) - \sum_d \log(1 + (\log (f_d / f_0) / s)^2)
+    \sum_i \log q_{f, c, r, a}(\theta_i \mid x_i) - \sum_d \log(1 + (\log (f_d / f_0) / s)^2)
     - \sum_d \log(1 + (\log c_d / s)^2) - \log(1 + (\log (r / r_0) / s_r)^2)
+    - \sum_d \log(1 + ((a_d - 1) / s_a)^2)
 
 over the held-out pairs (by their weights, which sum to the effective number of pairs): they stay
-near :math:`f_0`, which is 1 for averages and 1.1 for a network alone, near 1, and near :math:`r_0`,
+near :math:`f_0`, which is 1 for averages and 1.1 for a network alone, near 1, :math:`r_0` and 1,
 unless the pairs say otherwise, and follow them freely where they do, as those of a parameter that
 nothing is known about must. :math:`\log r_0 = 0.55` was likeliest for other pairs of three
 problems of four and near it for the fourth (Hopper, pendulum, CartPole, mountain car; 3,200 truths
@@ -46,6 +52,7 @@ _STEEPEST = 2.0  # power of deviations
 _NEAR = 0.15  # s: what a hundred pairs leave unsure
 _USUAL_TAILS, _NEAR_TAILS = 0.55, 0.3  # log r_0, and s of log r
 _HEAVIEST = 3.0  # r
+_NEAR_APART = 0.5  # s of a
 _TOO_SURE = 1.1  # what a network alone needs, where the pairs are too few to say
 _MOST = 2000  # held-out pairs that are used, those of the largest weight
 
@@ -74,11 +81,11 @@ def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase)
         middle = torch.stack(means).mean(0)
     size = len(middle)
     usual = torch.tensor(_usual(size, alone=alone)).to(z)
-    near = torch.tensor([_NEAR] * (2 * size) + [_NEAR_TAILS]).to(z)
+    near = torch.tensor([_NEAR] * (2 * size) + [_NEAR_TAILS] + [_NEAR_APART] * size).to(z)
 
     def scales(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return what is to be done to deviations: a factor, before that a power, and tails."""
-        log_factors, log_powers, tails = values.split([size, size, 1])
+        log_factors, log_powers, tails, _ = values.split([size, size, 1, size])
         powers = log_powers.exp()
         return (log_factors + (1 - powers) * middle).exp(), powers, tails[: 0 if alone else 1]
 
@@ -92,13 +99,13 @@ def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase)
             members = [in_training(n, m) for n, m in zip(networks, mixtures, strict=True)]
             away = (values - usual) / near
             total = away.square().log1p().sum() / pairs
-            total = total - (average(members).formula(z) * weight).sum()
+            total = total - (average(members, values[-size:]).formula(z) * weight).sum()
             (gradient,) = torch.autograd.grad(total, values)
         return total.item(), gradient.double().cpu().numpy().ravel()
 
     options = {"maxiter": 15, "ftol": 1e-6}
-    start = np.zeros(2 * size + 1)
-    start[-1] = usual[-1]  # at 0 the loss does not change with tails
+    start = usual.double().cpu().numpy().copy()
+    start[: 2 * size] = 0.0  # and not at 0 for tails, where the loss does not change with them
     found = minimize(
         loss,
         start,
@@ -113,22 +120,24 @@ def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase)
         network.network.widening.copy_(widening)
         network.network.contrast.copy_(contrast)
         network.network.tails = tails.to(network.network.tails)
+        network.network.apart.copy_(values[-size:])
     return values[:size].exp()
 
 
 def _usual(size: int, *, alone: bool) -> list[float]:
-    """Return the logarithms of factors, powers and ratio where the pairs say nothing."""
+    """Return the logarithms of factors, powers and ratio, and shares, of pairs that say nothing."""
     factor, tails = (math.log(_TOO_SURE), 0.0) if alone else (0.0, _USUAL_TAILS)
-    return [factor] * size + [0.0] * size + [tails]
+    return [factor] * size + [0.0] * size + [tails] + [1.0] * size
 
 
 def _bounds(size: int, *, alone: bool) -> list[tuple[float, float]]:
     """Return the least and the largest of them."""
     if alone:
-        return [(0.0, math.log(_WIDEST))] * size + [(0.0, 0.0)] * (size + 1)
+        return [(0.0, math.log(_WIDEST))] * size + [(0.0, 0.0)] * (size + 1) + [(1.0, 1.0)] * size
     factors = [(math.log(_NARROWEST), math.log(_WIDEST))] * size
     steepest = math.log(_STEEPEST)
-    return [*factors, *[(-steepest, steepest)] * size, (0.0, math.log(_HEAVIEST))]
+    powers, shares = [(-steepest, steepest)] * size, [(0.0, 1.0)] * size
+    return [*factors, *powers, (0.0, math.log(_HEAVIEST)), *shares]
 
 
 def _log_mean(posterior: MixtureDensityPosterior, raw: Tensor, weight: Tensor) -> Tensor:
@@ -138,8 +147,15 @@ def _log_mean(posterior: MixtureDensityPosterior, raw: Tensor, weight: Tensor) -
     return weight @ each.sum(-2).to(weight)
 
 
-def average(members: Sequence[TruncatedGaussianMixture]) -> TruncatedGaussianMixture:
+def average(
+    members: Sequence[TruncatedGaussianMixture], apart: Tensor | None = None
+) -> TruncatedGaussianMixture:
     """Return the mixture of mixtures, all with the same weight.
+
+    Args:
+        members: Of the same box and batch shape.
+        apart: Which share of the way from the average of their means to its own each keeps, in
+            every parameter, shape ``(D,)``; default all of it.
 
     Example:
         >>> one, two = (
@@ -150,14 +166,26 @@ def average(members: Sequence[TruncatedGaussianMixture]) -> TruncatedGaussianMix
         >>> both = average([one, two])
         >>> both.logits.exp()
         tensor([0.5000, 0.5000], dtype=torch.float64)
+        >>> average([one, two], torch.tensor([0.2])).loc.flatten()
+        tensor([-0.2000,  0.2000], dtype=torch.float64)
     """
     if len(members) == 1:
         return members[0]
+    loc = [member.loc for member in members]
+    if apart is not None:
+        means = torch.stack([_mean(member) for member in members])
+        nearer = (1 - apart.to(means)) * (means.mean(0) - means)
+        loc = [own + by.unsqueeze(-2) for own, by in zip(loc, nearer, strict=True)]
     return TruncatedGaussianMixture(
         torch.cat([member.logits for member in members], -1),
-        torch.cat([member.loc for member in members], -2),
+        torch.cat(loc, -2),
         torch.cat([member.scale_tril for member in members], -3),
         members[0].box,
         diagonal=all(member.diagonal for member in members),
         points=members[0].points,
     )
+
+
+def _mean(member: TruncatedGaussianMixture) -> Tensor:
+    """Return the mean of the components' means, ``(*, D)``: what a box cuts off is no matter."""
+    return (member.logits.softmax(-1).unsqueeze(-1) * member.loc).sum(-2)
