@@ -299,6 +299,7 @@ def entry(answer: Answer, prior: Any, tests: Tensor) -> dict[str, Any]:
         "nats": (answer.marginal - under_prior)[:-1].tolist(),
         "place": answer.place[:-1].tolist(),
         "joint_nats": joint_nats,
+        "region": None if answer.region is None else answer.region[:-1].tolist(),
     }
 
 

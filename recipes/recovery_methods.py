@@ -46,11 +46,14 @@ class Answer:
         marginal: Log-density of each parameter at the truth, shape ``(N, D)``.
         place: Share of each marginal below the truth, shape ``(N, D)``.
         joint: Log-density of all parameters together, ``(N,)``; ``None`` for draws.
+        region: Level of the highest-density region, of all parameters together, that the truth
+            lies on the edge of, ``(N,)``; ``None`` for what is no mixture.
     """
 
     marginal: Tensor
     place: Tensor
     joint: Tensor | None = None
+    region: Tensor | None = None
 
 
 Fitted = Callable[[Tensor, Tensor], Answer]
@@ -67,8 +70,8 @@ def averaged(networks: AveragedPosterior, truth: Tensor, summary: Tensor, *, see
     mean = summary.mean(1)
     q = networks.distribution(mean)
     test = TensorDict({"theta": truth, "summary": mean}, [len(truth)])
-    place = calibrate(networks, test, draws=DRAWS, seed=seed).rank
-    return Answer(marginal_log_prob(q, truth), place, q.log_prob(truth))
+    found = calibrate(networks, test, draws=DRAWS, seed=seed)
+    return Answer(marginal_log_prob(q, truth), found.rank, q.log_prob(truth), found.density)
 
 
 def pooled(networks: AveragedPosterior, truth: Tensor, summary: Tensor, *, seed: int) -> Answer:
@@ -77,8 +80,10 @@ def pooled(networks: AveragedPosterior, truth: Tensor, summary: Tensor, *, seed:
     found = []
     for own, several in zip(truth, summary, strict=True):
         q = networks.condition(several, check=False)
-        place = (q.sample((DRAWS,), generator=g) < own).float().mean(0)
-        found.append((marginal_log_prob(q, own), place, q.log_prob(own)))
+        draws, density = q.sample((DRAWS,), generator=g), q.log_prob(own)
+        place, region = (draws < own), (q.log_prob(draws) > density)
+        shares = place.float().mean(0), region.float().mean(0)
+        found.append((marginal_log_prob(q, own), shares[0], density, shares[1]))
     return Answer(*(torch.stack(part) for part in zip(*found, strict=True)))
 
 

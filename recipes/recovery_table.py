@@ -64,7 +64,11 @@ def uniform(place: Tensor) -> float | None:
 
 
 def joint(parts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Yield nats over the prior of all parameters together, and the time to fit, per method."""
+    """Yield nats over the prior of all parameters together, and the time to fit, per method.
+
+    And how many truths highest-density regions hold (expected coverage, Hermans et al., 2022,
+    arXiv:2110.06581), where the method says.
+    """
     for name in dict.fromkeys(part["problem"] for part in parts):
         own = [part for part in parts if part["problem"] == name]
         for method in own[0]["methods"]:
@@ -75,7 +79,14 @@ def joint(parts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
                     "method": method,
                     "nats": statistics.fmean(v for e in entries for v in e["joint_nats"]),
                     "seconds_fit": statistics.fmean(e["seconds_fit"] for e in entries),
+                    **_regions([level for e in entries for level in e.get("region") or ()]),
                 }
+
+
+def _regions(levels: list[float]) -> dict[str, Any]:
+    edge = torch.tensor(levels)
+    inside = {f"coverage_{round(100 * c)}": (edge <= c).float().mean().item() for c in (0.5, 0.9)}
+    return inside | {"sbc_p": uniform(edge), "truths": len(edge)} if levels else {"truths": 0}
 
 
 def table(result: dict[str, Any], names: list[str]) -> str:
@@ -102,7 +113,8 @@ def table(result: dict[str, Any], names: list[str]) -> str:
         lines += ["", *(f"- {text}" for text in result["said"].get(name, [])), ""]
     if result["paper_mode"]:
         lines += [*against_the_paper(result["rows"]), ""]
-    lines += [*calibration(result["rows"]), ""]
+    together = [{**row, "parameter": "all together"} for row in result["joint"]]
+    lines += [*calibration([*result["rows"], *together]), ""]
     lines += ["All parameters together, nats over the prior averaged over other truths:", ""]
     lines += ["| problem | method | nats | fit [s] |", "|---|---|---|---|"]
     lines += [
@@ -128,10 +140,10 @@ def against_the_paper(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def calibration(rows: list[dict[str, Any]]) -> list[str]:
-    """Return how often the intervals of our default networks hold the truth, and what ranks say."""
+    """Return how often our default networks' intervals and regions hold the truth, and ranks."""
     own = [
         row
-        for row in rows
+        for row in sorted(rows, key=lambda row: list(PROBLEMS).index(row["problem"]))
         if row["truths"] and (row["method"] == DEFAULTS or row["method"].startswith(BY_PRODUCT))
     ]
     if not own:
@@ -144,8 +156,9 @@ def calibration(rows: list[dict[str, Any]]) -> list[str]:
         for count in dict.fromkeys(row["truths"] for row in own)
     }
     lines = [
-        "How many of the truths our intervals hold, and the chance of ranks as uneven if they were "
-        "uniform. A right posterior's are 19 times of 20 in these bands, of "
+        "How many of the truths our intervals hold, and regions of highest density of all "
+        "parameters together, and the chance of ranks as uneven if they were uniform. A right "
+        "posterior's are 19 times of 20 in these bands, of "
         + "; of ".join(f"{count} truths {band}" for count, band in text.items())
         + ".",
         "",

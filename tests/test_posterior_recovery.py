@@ -1,6 +1,7 @@
 """The table of recovered parameters from its command line, as users run it."""
 
 import json
+import re
 import shutil
 from functools import partial
 from pathlib import Path
@@ -74,6 +75,7 @@ def test_table_and_picture_are_there(finished):
     (own,) = (row for row in rows_of(folder) if row["method"] == "BayesSim")
     assert f"| {own['coverage_90']:.1%} | {own['sbc_p']:.2g} | 32 |" in table
     assert "of 32 truths 50%: 31.2% to 68.8%, 90%: 78.1% to 100.0%." in table  # binomial
+    assert re.search(r"\| pendulum, all together \| BayesSim \| \d+\.\d% \| \d+\.\d% \|", table)
     assert (folder / "run/pendulum.png").stat().st_size > 5000
 
 
