@@ -132,29 +132,25 @@ def test_rivals_of_the_others_stand_beside_what_comes_to_the_front(monkeypatch):
     assert confusion_set(found, "action_delay") == ("action_delay", "sensor_delay")
 
 
-def test_a_strength_more_that_explains_no_more_than_chance_does_not_come_to_the_front():
-    best = model(1.0, "action_delay")
-    more = replace(model(1.0, "sensor_delay"), validation=0.985 * best.validation)
-    units = (*more.units, *model(1.0, "sensor_lag").units)
-    point = Point(best.fit.point.z, dict.fromkeys(units, 0.02))
-    more = replace(more, fit=replace(more.fit, units=units, point=point))
-    found = selection(best, more)
-    sets = dict.fromkeys(("train", "validation"))
-    assert settled(found, "action_delay", sets).best is best
+def with_another(best, *, square, gained):
+    """Return a selection in which two strengths explain so much more deviance than one."""
+    more = model(square, "sensor_delay", "sensor_lag")
+    share = gained / float((best.validation**2).sum())
+    more = replace(more, validation=np.sqrt(1 - share) * best.validation)
+    return replace(selection(best), alternatives={"action_delay": (more,)}), more
 
 
 @pytest.mark.parametrize(
-    "instead",
-    [
-        {"coulomb_friction": 0.17, "action_bias": 0.1},  # as much to make up for
-        {"coulomb_friction": 0.4, "action_bias": 0.05},  # more in all
-        {"armature": 0.17, "action_bias": 0.03},  # of another kind
-        {"coulomb_friction": 0.17},  # which had nothing to do
-    ],
+    ("square", "gained", "front"), [(1.0, 3.0, 0), (1.0, 14.0, 1), (9.0, 14.0, 0), (9.0, 126.0, 1)]
 )
-def test_other_equals_stay_behind_what_explains_a_little_more(instead):
-    assert not leaves_less_to_do(pair(1.0, **ONE_WAY), pair(1.001, **instead))
-
-
-def test_what_is_worse_is_no_equal_however_little_it_leaves_to_do():
-    assert not leaves_less_to_do(pair(1.0, **ONE_WAY), pair(2.0, **BOTH_WAYS))
+def test_a_strength_more_has_to_explain_more_than_chance_to_come_to_the_front(
+    monkeypatch, square, gained, front
+):
+    """Where nine times as much as noise is left, a deviance of 14 is what noise makes of 1.6."""
+    monkeypatch.setattr(confusion, "without_idle", lambda *given: given[-1])
+    monkeypatch.setattr(confusion, "parts", lambda *_: [])
+    best = model(square, "action_delay")
+    found, more = with_another(best, square=square, gained=gained)
+    sets = dict.fromkeys(("train", "validation"))
+    assert rivals(found, "action_delay") == [more]
+    assert settled(found, "action_delay", sets).best is (best, more)[front]

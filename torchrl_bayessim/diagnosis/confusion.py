@@ -144,13 +144,15 @@ def stand_in(selection: Selection, rival: Model) -> str:
 def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> Selection:
     """Return the selection with that one of equals in front that explains most.
 
-    Of training and validation, with a price for each strength: test runs choose nothing. Of those
-    that explain the same to the last, such as late commands and late sensors, it is the one with
-    fewer faults of sensors: it needs no names of channels to be put on a simulator. And of equals
-    that leave the other effects more and less to make up for, the one that leaves less.
+    Of training and validation, with a price for each strength: test runs choose nothing. Where more
+    than noise is left, deviances count by so much less (quasi-likelihood, Wedderburn 1974), or the
+    one with the most strengths would mend most of that. Of those that explain the same to the last,
+    such as late commands and late sensors, it is the one with fewer faults of sensors: it needs no
+    names of channels to be put on a simulator. And of equals that leave the other effects more and
+    less to make up for, the one that leaves less.
     """
     equals = [selection.best, *rivals(selection, name)]
-    costs = {model: criterion(model, 1.0) for model in equals}
+    costs = {model: criterion(model, selection.best.dispersion()) for model in equals}
     least = min(costs.values())
     same = [model for model in equals if costs[model] - least < _SAME]
     first = min(same, key=lambda model: (_sensing(model), costs[model]))
