@@ -99,6 +99,30 @@ def test_what_a_wandering_push_leaves_is_told():
     assert share > 80
 
 
+@pytest.mark.parametrize(
+    ("share", "hertz", "names"),
+    [
+        (0.2, 0.32, ["action_bias"]),
+        (0.28, 1.0, ["action_bias", "periodic_disturbance"]),
+        (0.6, 0.32, ["action_bias", "periodic_disturbance"]),
+    ],
+    ids=["a part, too slow to repeat", "it repeats", "more than a part"],
+)
+def test_a_wave_beside_a_push_is_the_push_wavering_unless_it_repeats(share, hertz, names):
+    rng = np.random.default_rng(0)
+    force = lambda t, q: 0.6 * (1 + share * np.sin(2 * np.pi * hertz * t))
+    logs = [ride(rng, 300, force, noise=[0.0005, 0.01]) for _ in range(6)]
+    report = diagnose(
+        cart(), None, logs, effects=["action_bias", "coulomb_friction", "periodic_disturbance"]
+    )
+    assert report.verdict == "named"
+    assert [found.name for found in report.effects] == names
+    assert sum(found.share_of_gap for found in report.effects) > 0.98
+    assert any("action bias wavers, slower than" in a for a in report.alarms) == (len(names) == 1)
+    # the simulator has it either way
+    assert {effect.name for effect in report.strengths} == {"action_bias", "periodic_disturbance"}
+
+
 @pytest.mark.parametrize(("spread", "told"), [(0.25, True), (0.0, False)])
 def test_what_is_noise_alone_does_not_vary(spread, told):
     base, _ = base_and_better(lambda s: spread * RUN[:, None] * s["bias"], lambda s: s["drift"])

@@ -16,6 +16,7 @@ from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
 from .acting import acting_regime
 from .candidates import candidates, concluded
+from .cells import plain
 from .confusion import settled
 from .credit import credit_of, unit_credit, worthwhile
 from .divergence import divergence_alarms, diverges_throughout
@@ -36,10 +37,11 @@ from .scatter import Scatter
 from .selection import Selection
 from .shrinkage import Shrinkage
 from .verdict import conclude
-from .wavering import wavering_alarms
+from .wavering import slow_waves, told_together, wavering_alarms
 from .whole_runs import whole_run_alarm
 
 Array = NDArray[np.float64]
+_WAVERS = "{} wavers, slower than runs can show to repeat: in the simulator a {} stands for that"
 _TOLD: tuple[str, ...] = "at the prior's mean", "with fitted parameters", "with the effects"
 
 
@@ -73,7 +75,8 @@ def assemble(
     offered = selection.screens[0].units
     best = with_slopes_of_forms(prepared.sets["train"], selection.best, offered)
     selection = replace(selection, best=best)
-    credit = credit_of(selection)
+    waves = slow_waves(best, prepared.sets["train"].segments, system.robot)
+    credit = told_together(credit_of(selection), waves)
     points = _points(selection)
     found = Found.of(prepared, selection, scatter, credit, points=points, generator=generator)
     seen = (
@@ -124,6 +127,7 @@ def assemble(
         if rules:
             where |= {"regimes": [asdict(rule) for rule in rules], "regimes_of": first}
         more += wavering_alarms(best, prepared.sets["train"].segments)
+        more += [_WAVERS.format(plain(push), plain(wave)) for wave, push in waves.items()]
     names, measured = {effect.name for effect in found.effects}, found.measured
     left = measured.effects if names else measured.refit
     seen = concluded(seen, verdict, names, left=left)
