@@ -154,3 +154,16 @@ def test_a_strength_more_has_to_explain_more_than_chance_to_come_to_the_front(
     sets = dict.fromkeys(("train", "validation"))
     assert rivals(found, "action_delay") == [more]
     assert settled(found, "action_delay", sets).best is (best, more)[front]
+
+
+@pytest.mark.parametrize(("apart", "front"), [(-0.04, 0), (0.04, 0), (-0.3, 1)])
+def test_of_twins_the_drives_comes_to_the_front(monkeypatch, apart, front):
+    monkeypatch.setattr(confusion, "parts", lambda *_: [])
+    drive, force = model(1.0, "action_bias"), model(1.0, "constant_force")
+    share = 1.0 + apart / float((force.validation**2).sum())
+    force = replace(force, validation=np.sqrt(share) * force.validation)
+    sets = dict.fromkeys(("train", "validation"))
+    for one, other in ((drive, force), (force, drive)):
+        name = one.units[0].name
+        found = replace(selection(one), alternatives={name: (other,)})
+        assert settled(found, name, sets).best is (drive, force)[front]

@@ -17,6 +17,7 @@ from .refit import refit
 from .selection import Selection
 
 _SAME = 2.0  # of a deviance: what fits of one and the same law may differ by
+_TWIN = 0.1  # the same, of what acts in one and the same way
 _LAST = 0.01  # of what an effect explains: too little to prefer one law to another
 _FORM = 0.1  # of the same: how well the form of a law is known
 _ELSEWHERE = 0.25  # of the same, by friction in contacts: chattering ones no fit follows exactly
@@ -101,6 +102,11 @@ def _sensing(model: Model) -> int:
     return sum(unit.effect.channel == "sensing" for unit in model.units)
 
 
+def _driving(model: Model) -> int:
+    """Return how many faults of drives a model has."""
+    return sum(unit.effect.channel == "actuation" for unit in model.units)
+
+
 def rivals(selection: Selection, name: str, *, form: float = _LAST) -> list[Model]:
     """Return the models with another effect in the place of one that are as good as the best.
 
@@ -148,14 +154,17 @@ def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> S
     than noise is left, deviances count by so much less (quasi-likelihood, Wedderburn 1974), or the
     one with the most strengths would mend most of that. Of those that explain the same to the last,
     such as late commands and late sensors, it is the one with fewer faults of sensors: it needs no
-    names of channels to be put on a simulator. And of equals that leave the other effects more and
-    less to make up for, the one that leaves less.
+    names of channels to be put on a simulator. Of twins, such as a bias of commands and a constant
+    force, it is the drive's, which is looked at first, and not the one that rounding prefers. And
+    of equals that leave the other effects more and less to make up for, the one that leaves less.
     """
     equals = [selection.best, *rivals(selection, name)]
     costs = {model: criterion(model, selection.best.dispersion()) for model in equals}
     least = min(costs.values())
     same = [model for model in equals if costs[model] - least < _SAME]
     first = min(same, key=lambda model: (_sensing(model), costs[model]))
+    twins = [m for m in same if _sensing(m) == _sensing(first) and costs[m] < costs[first] + _TWIN]
+    first = min(twins, key=lambda model: (-_driving(model), costs[model]))
     plainer = [m for m in equals if leaves_less_to_do(first, m) and _sensing(m) <= _sensing(first)]
     first = min(plainer, key=costs.__getitem__, default=first)
     if first is selection.best:
