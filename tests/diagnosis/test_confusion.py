@@ -167,3 +167,16 @@ def test_of_twins_the_drives_comes_to_the_front(monkeypatch, apart, front):
         name = one.units[0].name
         found = replace(selection(one), alternatives={name: (other,)})
         assert settled(found, name, sets).best is (drive, force)[front]
+
+
+@pytest.mark.parametrize(("apart", "front"), [(0.4, "gravity_tilt"), (1.9, "com_shift")])
+def test_the_likeliest_group_of_equals_comes_to_the_front(monkeypatch, apart, front):
+    """Two of the offsets together are likelier than a shifted centre of mass, if hardly worse."""
+    monkeypatch.setattr(confusion, "parts", lambda *_: [])
+    best = model(1.0, "com_shift")
+    share = np.sqrt(1.0 + apart / float((best.validation**2).sum()))
+    others = [model(1.0, name) for name in ("sensor_bias", "gravity_tilt")]
+    others = [replace(one, validation=share * one.validation) for one in others]
+    found = replace(selection(best), alternatives={"com_shift": tuple(others)})
+    sets = dict.fromkeys(("train", "validation"))
+    assert set(settled(found, "com_shift", sets).best.names) == {front}

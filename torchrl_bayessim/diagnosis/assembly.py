@@ -70,8 +70,9 @@ def assemble(
     """
     selection = worthwhile(selection, prepared.sets)
     credit = credit_of(selection)
-    if credit:
-        selection = settled(selection, max(credit, key=credit.__getitem__), prepared.sets)
+    for name in sorted(credit, key=lambda name: -credit[name]):
+        if name in selection.best.names:
+            selection = settled(selection, name, prepared.sets)
     offered = selection.screens[0].units
     best = with_slopes_of_forms(prepared.sets["train"], selection.best, offered)
     selection = replace(selection, best=best)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 __all__ = ["confusion_set", "rivals", "settled", "stand_in"]
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from ..effects.effect import Effect
@@ -152,16 +153,18 @@ def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> S
 
     Of training and validation, with a price for each strength: test runs choose nothing. Where more
     than noise is left, deviances count by so much less (quasi-likelihood, Wedderburn 1974), or the
-    one with the most strengths would mend most of that. Of those that explain the same to the last,
-    such as late commands and late sensors, it is the one with fewer faults of sensors: it needs no
-    names of channels to be put on a simulator. Of twins, such as a bias of commands and a constant
-    force, it is the drive's, which is looked at first, and not the one that rounding prefers. And
-    of equals that leave the other effects more and less to make up for, the one that leaves less.
+    one with the most strengths would mend most of that. Of those that explain the same it is one of
+    the likeliest group, all its effects together; of late commands and late sensors, the one with
+    fewer faults of sensors, which needs no names of channels to be put on a simulator; of twins,
+    such as a bias of commands and a constant force, the drive's, which is looked at first, and not
+    the one that rounding prefers. And of equals that leave the other effects more and less to make
+    up for, the one that leaves less.
     """
     equals = [selection.best, *rivals(selection, name)]
     costs = {model: criterion(model, selection.best.dispersion()) for model in equals}
     least = min(costs.values())
     same = [model for model in equals if costs[model] - least < _SAME]
+    same = _of_the_likeliest_group(same, costs, selection, name)
     first = min(same, key=lambda model: (_sensing(model), costs[model]))
     twins = [m for m in same if _sensing(m) == _sensing(first) and costs[m] < costs[first] + _TWIN]
     first = min(twins, key=lambda model: (-_driving(model), costs[model]))
@@ -181,6 +184,24 @@ def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> S
             stand_in(selection, first): others,
         },
     )
+
+
+def _of_the_likeliest_group(
+    models: Sequence[Model], costs: Mapping[Model, float], selection: Selection, name: str
+) -> list[Model]:
+    """Return the models with effects of one group, the likeliest if every effect may be there."""
+    least = min(costs[model] for model in models)
+    groups: dict[str, dict[str, float]] = {}
+    group_of = {}
+    for model in models:
+        own = {unit for unit in model.units if unit.name == name}
+        unit = next(iter(own)) if own else model.beyond(selection.best)[0]
+        group_of[model] = group = kind(unit.effect)
+        likely = groups.setdefault(group, {})
+        odds = math.exp(-0.5 * (costs[model] - least))
+        likely[unit.name] = max(likely.get(unit.name, 0.0), odds)
+    likeliest = max(groups, key=lambda group: sum(groups[group].values()))
+    return [model for model in models if group_of[model] == likeliest]
 
 
 def _beside(
