@@ -16,7 +16,6 @@ from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
 from .acting import acting_regime
 from .candidates import candidates, concluded
-from .cells import plain
 from .confusion import settled
 from .credit import credit_of, unit_credit, worthwhile
 from .divergence import divergence_alarms, diverges_throughout
@@ -37,11 +36,10 @@ from .scatter import Scatter
 from .selection import Selection
 from .shrinkage import Shrinkage
 from .verdict import conclude
-from .wavering import slow_waves, told_together, wavering_alarms
+from .wavering import slow_wave_alarms, slow_waves, told_together, wavering_alarms
 from .whole_runs import whole_run_alarm
 
 Array = NDArray[np.float64]
-_WAVERS = "{} wavers, slower than runs can show to repeat: in the simulator a {} stands for that"
 _TOLD: tuple[str, ...] = "at the prior's mean", "with fitted parameters", "with the effects"
 
 
@@ -128,7 +126,7 @@ def assemble(
         if rules:
             where |= {"regimes": [asdict(rule) for rule in rules], "regimes_of": first}
         more += wavering_alarms(best, prepared.sets["train"].segments)
-        more += [_WAVERS.format(plain(push), plain(wave)) for wave, push in waves.items()]
+        more += slow_wave_alarms(waves)
     names, measured = {effect.name for effect in found.effects}, found.measured
     left = measured.effects if names else measured.refit
     seen = concluded(seen, verdict, names, left=left)

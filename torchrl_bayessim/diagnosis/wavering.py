@@ -21,7 +21,7 @@ simulator, and is told with the push.
 
 from __future__ import annotations
 
-__all__ = ["slow_waves", "told_together", "waver", "wavering_alarms"]
+__all__ = ["slow_wave_alarms", "slow_waves", "told_together", "waver", "wavering_alarms"]
 
 from collections.abc import Mapping, Sequence
 
@@ -124,6 +124,15 @@ def _push_beside(model: Model, wave: Unit, robot: Robot) -> Unit | None:
 
 def _size(model: Model, unit: Unit) -> float:
     return float(np.linalg.norm(model.fit.change(unit)))
+
+
+def slow_wave_alarms(waves: Mapping[str, str]) -> list[str]:
+    """Return an alarm for each wave that is told with its push."""
+    return [
+        f"{plain(push)} wavers, slower than runs can show to repeat: in the simulator a "
+        f"{plain(wave)} stands for that"
+        for wave, push in waves.items()
+    ]
 
 
 def told_together(credit: Mapping[str, float], waves: Mapping[str, str]) -> dict[str, float]:
