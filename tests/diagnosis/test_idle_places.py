@@ -9,7 +9,7 @@ from plain_models import A, B, C, Unit, plain
 
 from torchrl_bayessim.diagnosis.alternatives import exchanged
 from torchrl_bayessim.diagnosis.credit import worthwhile
-from torchrl_bayessim.diagnosis.elimination import _idle_place
+from torchrl_bayessim.diagnosis.elimination import _idle_place, _without_doubt
 from torchrl_bayessim.diagnosis.model import Model
 from torchrl_bayessim.diagnosis.selection import Selection
 
@@ -26,6 +26,28 @@ def test_a_place_that_next_to_nothing_is_due_to_is_idle(without, idle):
 def test_an_effect_of_its_own_is_not_idle():
     smaller = [plain([C], 9e6), plain([A], 510.0)]
     assert _idle_place(plain([A, C], 500.0), smaller) is None
+
+
+@pytest.mark.parametrize(
+    ("without", "left", "logs", "needed"),
+    [
+        (9000.0, 500.0, 2, True),
+        (4000.0, 500.0, 2, False),  # not down to noise
+        (9000.0, 500.0, 1, False),  # whatever happened in that one
+        (9000.0, 7000.0, 2, False),
+    ],
+)
+def test_what_the_runs_that_judge_never_excite_is_needed_by_the_runs_of_the_fit(
+    without, left, logs, needed
+):
+    """A speed limit, where only the runs of the fit are fast."""
+    best = plain([A, C], left)
+    slow = plain([A], left)
+    fast = np.sqrt(without / 200) * np.ones_like(slow.fit.innovations)
+    smaller = replace(slow, fit=replace(slow.fit, innovations=fast))
+    of_logs = np.r_[np.arange(20) % logs, np.full(20, logs)]
+    best, smaller = (replace(m, logs=of_logs) for m in (best, smaller))
+    assert _without_doubt(smaller, best) == needed
 
 
 @pytest.mark.parametrize(

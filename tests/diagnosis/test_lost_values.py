@@ -14,9 +14,11 @@ from test_diagnose import logs, system
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.found import _matters as found_matters
 from torchrl_bayessim.diagnosis.loss_law import LossLaw, Tried, likeliest
-from torchrl_bayessim.diagnosis.loss_suspects import _explained
+from torchrl_bayessim.diagnosis.loss_suspects import Alone, _explained
+from torchrl_bayessim.diagnosis.losses import _found
 from torchrl_bayessim.diagnosis.model import Model
 from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
+from torchrl_bayessim.effects.sensors import SensorDropout
 from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.system import System
@@ -150,6 +152,45 @@ def test_friction_and_samples_that_are_not_renewed_are_both_named():
     assert sum(shares) == pytest.approx(explained(report))
     low, high = report.gap.ci95
     assert low <= explained(report) <= high
+
+
+def short_segments(rng, *, lost, spoiled, count=60, steps=8):
+    """Segments that noise alone is in, and some with a lost value or spoiled by something else."""
+    tried = np.tile(rng.chisquare(16, count) / 16, (1 + steps, 1))
+    tried[1:] += 2.0
+    tried[:, :spoiled] += 20.0
+    for s in range(spoiled, spoiled + lost):
+        tried[0, s] += 8.0
+        tried[1 + rng.integers(steps), s] -= 2.0
+    patterns = Tried(tried, np.r_[0, np.ones(steps, dtype=int)], values=steps)
+    return SimpleNamespace(
+        tried=lambda unit: patterns, without=patterns.without, left=np.zeros((count, 16))
+    )
+
+
+@pytest.mark.parametrize(
+    ("lost", "spoiled", "beside", "found"),
+    [
+        ((12, 12), 3, True, True),
+        ((6, 6), 14, True, True),  # clear, whatever spoils a quarter of the segments
+        ((6, 6), 14, False, False),  # something is wrong that may look like losses
+        ((12, 12), 22, True, False),
+        ((24, 0), 3, True, True),  # a burst in the runs of the fit
+        ((24, 0), 3, False, False),
+        ((0, 0), 14, True, False),
+    ],
+)  # fmt: skip
+def test_losses_beside_an_effect_that_explain_what_they_spoil_are_found(
+    lost, spoiled, beside, found
+):
+    rng = np.random.default_rng(0)
+    counts = dict(zip(("train", "validation", "test"), (*lost, 12), strict=True))
+    data = {n: short_segments(rng, lost=k, spoiled=spoiled) for n, k in counts.items()}
+    unit = SimpleNamespace(effect=SensorDropout(), high=0.5)
+    chance = _found(data, unit, Alone.of(data), beside=beside)
+    assert (chance is not None) == found
+    if found:
+        assert chance.strength == pytest.approx(sum(lost) / 2 / (60 - spoiled) / 8, rel=0.5)
 
 
 def test_losses_are_not_tried_where_an_effect_that_lasts_leaves_noise_alone(monkeypatch):

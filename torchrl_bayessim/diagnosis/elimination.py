@@ -20,6 +20,7 @@ from .objective import Objective, Point, Unit
 from .refit import refit
 
 _IDLE = 1e-3  # of the deviance that an effect explains at another place
+_TIMES, _PLAIN = 10.0, 40.0  # deviance without an effect per that with it, and that of a segment
 _APART = 3  # effects without each of which a model is fitted with derivatives of its own
 
 
@@ -32,9 +33,9 @@ def eliminated(train: Objective, validation: Objective, model: Model) -> tuple[M
         criteria = [criterion(m, model.dispersion()) for m in smaller]
         best = int(np.argmin(criteria))
         loss = gain(smaller[best], model)
-        if criteria[best] > criterion(model, model.dispersion()) and loss > needed(
-            smaller[best], model
-        ):
+        worse = criteria[best] > criterion(model, model.dispersion())
+        needs = loss > needed(smaller[best], model) or _without_doubt(smaller[best], model)
+        if worse and needs:
             idle = _idle_place(model, smaller)
             if idle is None:
                 break
@@ -42,6 +43,17 @@ def eliminated(train: Objective, validation: Objective, model: Model) -> tuple[M
         model = smaller[best]
     there = refit(train, [model.fit.point], iterations=0)[0]
     return replace(model, fit=there), tried
+
+
+def _without_doubt(smaller: Model, model: Model) -> bool:
+    """Return whether the runs of the fit need what the runs that judge may never have excited.
+
+    A speed limit shows where the robot is fast, which may have been in other runs. What only makes
+    up for another cause does not bring what is left down to noise.
+    """
+    lost = smaller.deviances() - model.deviances()
+    several = len(np.unique(model.logs[lost > _PLAIN])) > 1
+    return several and float(smaller.deviances().sum()) > _TIMES * float(model.deviances().sum())
 
 
 def _without_each(train: Objective, validation: Objective, model: Model) -> list[Model]:

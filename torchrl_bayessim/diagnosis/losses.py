@@ -48,7 +48,8 @@ _SHARES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.25, 0.4, 0.6)  # s
 _NEEDED, _LIKELY = 40.0, 6.0
 _EXPLAINED = 0.5  # of the excess of the segments concerned, by what is left of them
 _STANDS_OUT = 1.0  # excess of segments with lost commands, to be found beside an effect
-_CLEARLY = 0.1  # of it, if it is less, may be left
+_CLEARLY = 0.1  # of it may be left of what is found clearly
+_FEW = 0.1  # of the deviance that such losses explain: what they may cost in runs without any
 _BIASED = 0.1  # of the excess of the segments concerned, which parameters leave in all
 _OTHERS = 1 / 6  # of the segments that something else may have spoiled
 _REMAIN = 0.6  # or of those that were spoiled without losses
@@ -208,7 +209,7 @@ def _found(
     scatters = [s for s in SCATTER.tolist() if s <= base.scatter][-3:]
     law = likeliest(judged, _SHARES, scatters, SPOILED, size=base.size)
     gains = [cost - law.deviance([one]) for cost, one in zip(alone.costs, judged, strict=True)]
-    if sum(gains) < _NEEDED or gains[1] < -_LIKELY:
+    if sum(gains) < _NEEDED:
         return None
     told = {name: law.told(one) for name, one in tried.items()}
     known = Told.joined([told[name] for name in JUDGED])
@@ -216,13 +217,18 @@ def _found(
     if concerned.sum() < FEWEST:
         return None
     excess = [float((one[concerned] - law.scatter).mean()) for one in (known.before, known.after)]
+    clear = sum(gains) > _EVIDENT and excess[1] < _CLEARLY * excess[0]
+    surely = beside and clear
+    # where losses come in bursts, the runs that judge may have had hardly any
+    if gains[1] < -max(_LIKELY, _FEW * gains[0] if surely else 0.0):
+        return None
     # parameters that were fitted without losses are a little off everywhere
     noise = max(NOISE, min(LEFT, 1.0 + _BIASED * excess[0]))
-    if law.scatter > noise or spoiled_share(known) > max(_OTHERS, _REMAIN * alone.spoiled):
+    spoiled = max(_OTHERS, _REMAIN * alone.spoiled, _WRONG if surely else 0.0)
+    if law.scatter > noise or spoiled_share(known) > spoiled:
         return None  # something else is wrong everywhere, and may look like this
     if excess[1] > _EXPLAINED * excess[0]:
         return None
-    clear = sum(gains) > _EVIDENT and excess[1] < _CLEARLY * excess[0]
     faint = law.share > unit.high or (excess[0] < _STANDS_OUT and not clear)
     if beside and isinstance(unit.effect, PacketDrop) and faint:
         return None
