@@ -213,24 +213,7 @@ def _found(
         return None
     told = {name: law.told(one) for name, one in tried.items()}
     known = Told.joined([told[name] for name in JUDGED])
-    concerned = known.lost > LIKELIER
-    if concerned.sum() < FEWEST:
-        return None
-    excess = [float((one[concerned] - law.scatter).mean()) for one in (known.before, known.after)]
-    clear = sum(gains) > _EVIDENT and excess[1] < _CLEARLY * excess[0]
-    surely = beside and clear
-    # where losses come in bursts, the runs that judge may have had hardly any
-    if gains[1] < -max(_LIKELY, _FEW * gains[0] if surely else 0.0):
-        return None
-    # parameters that were fitted without losses are a little off everywhere
-    noise = max(NOISE, min(LEFT, 1.0 + _BIASED * excess[0]))
-    spoiled = max(_OTHERS, _REMAIN * alone.spoiled, _WRONG if surely else 0.0)
-    if law.scatter > noise or spoiled_share(known) > spoiled:
-        return None  # something else is wrong everywhere, and may look like this
-    if excess[1] > _EXPLAINED * excess[0]:
-        return None
-    faint = law.share > unit.high or (excess[0] < _STANDS_OUT and not clear)
-    if beside and isinstance(unit.effect, PacketDrop) and faint:
+    if not _explain(law, known, gains, alone=alone, unit=unit, beside=beside):
         return None
     share, low, high = np.minimum(law.share_within(judged), unit.high)
     shown = told["test"]
@@ -246,3 +229,29 @@ def _found(
         left=shown.after[sound],
         before=float(shown.before[sound].mean()),
     )
+
+
+def _explain(
+    law: LossLaw, known: Told, gains: Sequence[float], *, alone: Alone, unit: Unit, beside: bool
+) -> bool:
+    """Return whether losses explain the segments that have them, and little else is wrong."""
+    concerned = known.lost > LIKELIER
+    if concerned.sum() < FEWEST:
+        return False
+    before, after = (
+        float((e[concerned] - law.scatter).mean()) for e in (known.before, known.after)
+    )
+    clear = sum(gains) > _EVIDENT and after < _CLEARLY * before
+    surely = beside and clear
+    # where losses come in bursts, the runs that judge may have had hardly any
+    if gains[1] < -max(_LIKELY, _FEW * gains[0] if surely else 0.0):
+        return False
+    # parameters that were fitted without losses are a little off everywhere
+    noise = max(NOISE, min(LEFT, 1.0 + _BIASED * before))
+    spoiled = max(_OTHERS, _REMAIN * alone.spoiled, _WRONG if surely else 0.0)
+    if law.scatter > noise or spoiled_share(known) > spoiled:
+        return False  # something else is wrong everywhere, and may look like this
+    if after > _EXPLAINED * before:
+        return False
+    faint = law.share > unit.high or (before < _STANDS_OUT and not clear)
+    return not (beside and isinstance(unit.effect, PacketDrop) and faint)
