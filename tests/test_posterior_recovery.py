@@ -21,7 +21,9 @@ run = partial(run_recipe, RECIPE)
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recovery")
-    status, out, err = run("short=true", "problem=pendulum", "out=run", folder=folder)
+    status, out, err = run(
+        "short=true", "processes=1", "problem=pendulum", "out=run", folder=folder
+    )
     assert status == 0, err
     return folder, out
 
@@ -86,7 +88,9 @@ def test_a_missing_part_is_run_again_to_the_same_numbers_and_no_other(
     missing, *others = sorted((tmp_path / "run/parts").iterdir())
     before = [path.stat().st_mtime_ns for path in others]
     missing.unlink()
-    status, _, err = run("short=true", "problem=pendulum", "out=run", folder=tmp_path)
+    status, _, err = run(
+        "short=true", "processes=1", "problem=pendulum", "out=run", folder=tmp_path
+    )
     assert status == 0, err
     assert others
     assert [path.stat().st_mtime_ns for path in others] == before
@@ -95,7 +99,8 @@ def test_a_missing_part_is_run_again_to_the_same_numbers_and_no_other(
 
 def test_by_the_papers_protocol_ten_trajectories_together_tell_more_than_their_mean(tmp_path):
     status, _, err = run(
-        *("short=true", "paper_mode=true", "problem=pendulum", "online=false", "out=run"),
+        *("short=true", "processes=1", "paper_mode=true", "problem=pendulum"),
+        *("online=false", "out=run"),
         folder=tmp_path,
     )
     assert status == 0, err

@@ -24,11 +24,15 @@ def commands():
 
 def truth(shaft):
     """Return the joint's positions where rotor and load are two bodies."""
-    model = two_bodies(shaft, 2e-5)
+    return driven_by(two_bodies(shaft, 2e-5), round(CONTROL / 2e-5))
+
+
+def driven_by(model, substeps):
+    """Return the first joint's positions under the commands, each held for so many steps."""
     data, found = mujoco.MjData(model), []
     for u in commands():
         data.ctrl[0] = u
-        mujoco.mj_step(model, data, round(CONTROL / 2e-5))
+        mujoco.mj_step(model, data, substeps)
         found.append(data.qpos[0])
     return np.array(found)
 
@@ -45,7 +49,8 @@ def simulated(law, strength, dt):
 
 @cache
 def rigid(dt):
-    return simulated(effect("series_elasticity"), 0.0, dt)
+    """Return them where the rotor is the joint's armature and the shaft is stiff."""
+    return driven_by(one_body(dt), round(CONTROL / dt))
 
 
 def share_left(real, law, strength, dt):

@@ -148,3 +148,12 @@ def test_parameters_known_only_together_are_named_as_a_pair(sign, what):
 
 def test_independent_parameters_are_no_pair():
     assert identifiability(gaussian(BOX, [[0.1, 0.0], [0.0, 0.1]])).pairs == []
+
+
+def test_one_draw_of_every_share_says_what_all_say(monkeypatch):
+    found = []
+    posterior = gaussian(BOX, [[0.5, 0.0], [0.4, 0.05]])
+    for strata in (256, 10**6):
+        monkeypatch.setattr("torchrl_bayessim.inference.identifiability._STRATA", strata)
+        found.append(identifiability(posterior).nats)
+    assert torch.allclose(*found, atol=0.005)
