@@ -58,7 +58,8 @@ class Problem:
         summaries: Statistics of our own defaults.
         paper_summaries: Statistics of the paper.
         unidentifiable: Parameters that do not enter the dynamics.
-        costly: Whether a thousand trajectories take minutes, not seconds.
+        costly: Whether a thousand trajectories take a minute, not seconds: methods that simulate
+            for one observation are asked with the first seed only.
         needs: Package that the simulator needs beyond the main dependencies.
     """
 
@@ -277,7 +278,6 @@ PROBLEMS: dict[str, Problem] = {
         steps=100,
         episodes=1,
         environments=250,
-        costly=True,
         summaries=(cross_correlation, waypoints(5)),
     ),
     "hopper_pybullet": Problem(

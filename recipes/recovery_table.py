@@ -25,7 +25,7 @@ def rows(parts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
         problem = PROBLEMS[name]
         for d, parameter in enumerate(problem.prior.names):
             for method in own[0]["methods"]:
-                entries = [part["methods"][method] for part in own]
+                entries = _entries(own, method)
                 at_truth = [e["log_prob"][d] for e in entries]
                 nats = [row[d] for e in entries for row in e["nats"]]
                 place = torch.tensor([row[d] for e in entries for row in e["place"]])
@@ -44,10 +44,15 @@ def rows(parts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
                     "seconds_simulate": statistics.fmean(p["seconds_simulate"] for p in own),
                     "seconds_fit": None if None in fits else statistics.fmean(fits),
                     "simulations": own[0]["simulations"],
-                    "seeds": len(own),
+                    "seeds": len(entries),
                     "paper_best": problem.paper[parameter],
                     "prior": -math.log(problem.prior.high[d] - problem.prior.low[d]),
                 }
+
+
+def _entries(parts: list[dict[str, Any]], method: str) -> list[dict[str, Any]]:
+    """Return what a method said with each seed that it was asked with; the first has all."""
+    return [part["methods"][method] for part in parts if method in part["methods"]]
 
 
 def covered(place: Tensor, level: float) -> float | None:
@@ -72,7 +77,7 @@ def joint(parts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
     for name in dict.fromkeys(part["problem"] for part in parts):
         own = [part for part in parts if part["problem"] == name]
         for method in own[0]["methods"]:
-            entries = [part["methods"][method] for part in own]
+            entries = _entries(own, method)
             if all(e["joint_nats"] for e in entries):
                 yield {
                     "problem": name,

@@ -43,6 +43,24 @@ def test_ranks_that_are_not_uniform_are_told(monkeypatch):
     assert uniform(even[:0]) is None
 
 
+def test_a_method_is_averaged_over_the_seeds_that_it_was_asked_with(monkeypatch):
+    monkeypatch.syspath_prepend(RECIPE.parent)
+    from recovery_table import cell, joint, rows
+
+    def part(**at_truth):
+        entry = {"nats": [], "place": [], "joint_nats": None, "seconds_fit": None}
+        methods = {name: entry | {"log_prob": [value]} for name, value in at_truth.items()}
+        return {
+            "problem": "pendulum", "methods": methods, "seconds_simulate": 1.0, "simulations": 9,
+        }  # fmt: skip
+
+    parts = [part(BayesSim=1.0, MCMC=5.0), part(BayesSim=3.0)]
+    both, once = rows(parts)
+    assert (both["log_prob_mean"], both["seeds"], once["seeds"]) == (2.0, 2, 1)
+    assert cell(once) == "5.00"
+    assert list(joint(parts)) == []
+
+
 def test_rows_have_what_others_read(finished):
     folder, out = finished
     result = json.loads((folder / "run/result.json").read_text())
