@@ -20,7 +20,8 @@ from .objective import Objective, Point, Unit
 from .refit import refit
 
 _IDLE = 1e-3  # of the deviance that an effect explains at another place
-_TIMES, _PLAIN = 10.0, 40.0  # deviance without an effect per that with it, and that of a segment
+# deviance without an effect per that with it, that of a segment, and that with it, where judged
+_TIMES, _PLAIN, _WORSE = 10.0, 40.0, 1.5
 _APART = 3  # effects without each of which a model is fitted with derivatives of its own
 
 
@@ -51,9 +52,10 @@ def _without_doubt(smaller: Model, model: Model) -> bool:
     A speed limit shows where the robot is fast, which may have been in other runs. What only makes
     up for another cause does not bring what is left down to noise.
     """
-    lost = smaller.deviances() - model.deviances()
-    several = len(np.unique(model.logs[lost > _PLAIN])) > 1
-    return several and float(smaller.deviances().sum()) > _TIMES * float(model.deviances().sum())
+    mine, others = model.deviances(), smaller.deviances()
+    several = len(np.unique(model.logs[others - mine > _PLAIN])) > 1
+    held_out = float((model.validation**2).sum()) < _WORSE * float((smaller.validation**2).sum())
+    return several and held_out and float(others.sum()) > _TIMES * float(mine.sum())
 
 
 def _without_each(train: Objective, validation: Objective, model: Model) -> list[Model]:
