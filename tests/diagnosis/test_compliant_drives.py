@@ -29,7 +29,7 @@ SOME = (
 def logs(shaft, seed):
     model, rng, found = two_bodies(shaft, 5e-5), np.random.default_rng(seed), []
     for _ in range(6):
-        data, t = mujoco.MjData(model), 0.02 * np.arange(200)
+        data, t = mujoco.MjData(model), 0.02 * np.arange(140)
         waves = rng.uniform(0.2, 0.5, 4), rng.uniform(2.0, 18.0, 4), rng.uniform(0.0, 6.0, 4)
         u = sum(a * np.sin(w * t + p) for a, w, p in zip(*waves, strict=True))
         rows = []

@@ -44,7 +44,7 @@ def system():
     )
 
 
-def recorded(run, *, friction=0.4, rows=150):
+def recorded(run, *, friction=0.4, rows=120):
     """Return a log, and the states as they were."""
     rng = np.random.default_rng(run)
     model = mujoco.MjModel.from_xml_string(BLOCK)

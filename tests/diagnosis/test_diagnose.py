@@ -223,7 +223,7 @@ def test_the_frequency_of_a_disturbance_is_found():
 
 
 def test_what_a_larger_cause_hides_is_given_its_frequency_beside_it():
-    data = logs(push=lambda q, v: 0.06 * np.sin(9 * q + 1.0) - 1.5 * q)
+    data = logs(5, push=lambda q, v: 0.06 * np.sin(9 * q + 1.0) - 1.5 * q)
     effects = "parallel_spring", "cogging", "coulomb_friction", "constant_force"
     report = diagnose(system(), None, data, effects=effects)
     spring, cogging = report.effects
