@@ -34,6 +34,15 @@ def recipes_on_path(monkeypatch):
     monkeypatch.syspath_prepend(RECIPES)
 
 
+@pytest.fixture
+def at_rest(recipes_on_path, monkeypatch):
+    """Cases without motions: what is drawn before them is all that is asked for."""
+    from withheld import cases
+
+    monkeypatch.setattr(cases, "_motions", lambda *_, **__: [])
+    monkeypatch.setattr(cases, "detectability", lambda *_, **__: 1.0)
+
+
 def imported(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -471,7 +480,7 @@ def test_nobody_knows_what_chance_would_have_done():
     assert beside(plant(causes), [motion], 0) is None
 
 
-def test_a_sensor_of_velocities_has_velocities_logged_and_a_withheld_case_a_list():
+def test_a_sensor_of_velocities_has_velocities_logged_and_a_withheld_case_a_list(at_rest):
     from withheld.cases import Plan, make
 
     for seed in range(3):
@@ -482,11 +491,8 @@ def test_a_sensor_of_velocities_has_velocities_logged_and_a_withheld_case_a_list
         assert "coulomb_friction" in case.effects
 
 
-def test_of_two_causes_both_act(monkeypatch):
+def test_of_two_causes_both_act(at_rest):
     from withheld import cases
-
-    monkeypatch.setattr(cases, "_motions", lambda *_, **__: [])  # the chain is known before
-    monkeypatch.setattr(cases, "detectability", lambda *_, **__: 1.0)
 
     def chain(*names):
         case = cases.make(cases.Plan("T5", "arm", names), np.random.default_rng(1))

@@ -90,14 +90,17 @@ def dynamics(model: mujoco.MjModel, record: Record, log: Log, half: int) -> Dyna
     needed, actuated, bias = (np.zeros((len(log), model.nv)) for _ in range(3))
     free = np.ones(len(log), dtype=bool)
     barred = {int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)}
+    q, v, u = data.qpos, data.qvel, data.ctrl  # each access makes an array anew
+    driven, biased = data.qfrc_actuator, data.qfrc_bias
     with room("the model"):
         for t in range(len(log)):
-            data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[t], qvel[t], ctrl[t]
+            q[:], v[:], u[:] = qpos[t], qvel[t], ctrl[t]
             mujoco.mj_forward(model, data)
-            actuated[t], bias[t] = data.qfrc_actuator, data.qfrc_bias
-            free[t] = data.ncon == 0 and not barred & set(data.efc_type.tolist())
+            actuated[t], bias[t] = driven, biased
+            if data.nefc:
+                free[t] = data.ncon == 0 and not barred & set(data.efc_type.tolist())
             mujoco.mj_mulM(model, data, needed[t], slope[t])
-            needed[t] += data.qfrc_bias
+    needed += bias
     actuated = held(actuated, half)
     spread = np.ones(2 * _CONTACT * half + 1)
     free = np.convolve(~free, spread, mode="same") < 0.5
