@@ -129,10 +129,12 @@ def _confusion(records: Sequence[Record], threshold: float, path: Path) -> None:
                 counts[names.index(one["class"][0]), names.index(said)] += 1
     figure = Figure(figsize=(7, 6), layout="constrained")
     axes = figure.subplots()
-    axes.imshow(counts / np.maximum(counts.sum(1, keepdims=True), 1), cmap="Blues", vmin=0, vmax=1)
+    share = counts / np.maximum(counts.sum(1, keepdims=True), 1)
+    axes.imshow(share, cmap="Blues", vmin=0, vmax=1)
     for (i, j), count in np.ndenumerate(counts):
         if count:
-            axes.text(j, i, f"{count:.0f}", ha="center", va="center")
+            color = "white" if share[i, j] > 0.5 else "black"
+            axes.text(j, i, f"{count:.0f}", ha="center", va="center", color=color)
     axes.set_xticks(range(len(names)), names, rotation=60, ha="right")
     axes.set_yticks(range(len(names) - 1), names[:-1])
     axes.set(xlabel="named", ylabel="true class", title="T1 and T2, visible causes")
