@@ -130,7 +130,7 @@ class Laboratory:
         problem: The problem.
         paper: Whether a system shows one trajectory, and the robot several, as in the paper; both
             kinds of statistics then stand side by side.
-        environments: Simulated at once.
+        environments: Simulated at once, at most; fewer where the problem has fewer.
         seed: Of the simulations.
     """
 
@@ -138,7 +138,8 @@ class Laboratory:
         self.problem, self.paper, self.seed = problem, paper, seed
         functions = (*problem.paper_summaries, *problem.summaries) if paper else problem.summaries
         self.randomizer = DomainRandomizer(problem.prior)
-        env = problem.make(self.randomizer, environments=environments, seed=seed)
+        width = min(environments, problem.environments)
+        env = problem.make(self.randomizer, environments=width, seed=seed)
         policy = None if problem.policy is None else problem.policy()
         self.collector = make_collector(env, policy, steps=problem.steps)
         self.statistics = SummaryStatistics(*functions)
@@ -178,8 +179,8 @@ def answered(settings: Recovery, name: str, seed: int) -> dict[str, Any]:
     start = time.perf_counter()
     problem = PROBLEMS[name]
     prior = problem.prior
-    width = min(problem.environments, settings.simulations)
-    lab = Laboratory(problem, paper=settings.paper_mode, environments=width, seed=seed)
+    asked = settings.simulations
+    lab = Laboratory(problem, paper=settings.paper_mode, environments=asked, seed=seed)
     theta = draw(prior, settings.simulations, key=(seed, "theta"))
     x = lab(theta)[:, 0]
     seconds = time.perf_counter() - start
@@ -204,8 +205,7 @@ def answered(settings: Recovery, name: str, seed: int) -> dict[str, Any]:
                 pictured["posterior"] = condition(given[-1])
         once = not problem.costly or seed == settings.seed
         if settings.paper_mode and settings.online and once and kind != PAPER:
-            few = min(problem.environments, 100)
-            small = Laboratory(problem, paper=settings.paper_mode, environments=few, seed=seed)
+            small = Laboratory(problem, paper=settings.paper_mode, environments=100, seed=seed)
             alone = lambda t, small=small, columns=columns: small(t)[:, 0, columns]
             mean = given[-1].mean(0)
             for method, answer in online(settings, prior, alone, mean, truth=truth, seed=seed):

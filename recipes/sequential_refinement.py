@@ -117,10 +117,8 @@ def robots(settings: Refinement, name: str) -> tuple[torch.Tensor, torch.Tensor]
 
 
 def laboratory(name: str, width: int, *, seed: int) -> Laboratory:
-    """Return the simulator, so many at once."""
-    problem = PROBLEMS[name]
-    width = min(width, problem.environments)
-    return Laboratory(problem, paper=False, environments=width, seed=seed)
+    """Return the simulator, so many at once at most."""
+    return Laboratory(PROBLEMS[name], paper=False, environments=width, seed=seed)
 
 
 def all_at_once(settings: Refinement, name: str) -> list[list[float]]:

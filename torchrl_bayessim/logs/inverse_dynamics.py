@@ -97,8 +97,8 @@ def dynamics(model: mujoco.MjModel, record: Record, log: Log, half: int) -> Dyna
             q[:], v[:], u[:] = qpos[t], qvel[t], ctrl[t]
             mujoco.mj_forward(model, data)
             actuated[t], bias[t] = driven, biased
-            if data.nefc:
-                free[t] = data.ncon == 0 and not barred & set(data.efc_type.tolist())
+            limits = data.nefc and barred & set(data.efc_type.tolist())
+            free[t] = data.ncon == 0 and not limits
             mujoco.mj_mulM(model, data, needed[t], slope[t])
     needed += bias
     actuated = held(actuated, half)
