@@ -681,10 +681,17 @@ def test_who_names_nothing_has_found_no_place_and_reserve_is_told():
     assert (found["channel"], found["joint"]) == (True, True)
     assert found["p_value"] == 0.25
     assert (lost["channel"], lost["joint"]) == (False, False)
+    motor = record(
+        label | {"truths": [truth | {"channel": "actuation"}]}, report | {"verdict": "ambiguous"}
+    )
+    assert (motor["channel"], motor["channel_among"], motor["channels"]) == (False, True, 2)
+    assert not lost["channel_among"]
     every = [found, lost, crashed]
     result = scores([*every, *(one | {"tier": "T3"} for one in every)], threshold=100.0)
     assert result["where"]["joint"]["value"] == pytest.approx(1 / 3)
     assert result["where"]["joint_of_right_class"]["value"] == 1.0
+    assert result["where"]["channel_among_reported"]["n"] == 3
+    assert result["where"]["channel_where_one_is_reported"]["n"] == 0
     t1, t3 = result["tiers"]["T1"], result["tiers"]["T3"]
     assert t1["right_as_ambiguous"]["value"] == pytest.approx(1 / 3)
     assert t1["set_size"] == 2.0

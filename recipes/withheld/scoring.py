@@ -17,6 +17,7 @@ from .classes import class_of
 Record = dict[str, Any]
 NAMING = {"named", "named_partial", "ambiguous"}
 _CHANNELS = {"actuation", "body", "contact", "sensing"}
+_PERHAPS = 0.1  # share of the gap from which a report says that a channel may be at fault
 
 
 def share(hits: Iterable[bool]) -> dict[str, Any]:
@@ -105,6 +106,9 @@ def _located(
         channels = (report.get("where") or {}).get("channel") or {}
         said = max(channels, key=lambda name: channels[name]) if effects and channels else None
         one["channel"] = said == truth["channel"]
+        perhaps = [name for name, part in channels.items() if part >= _PERHAPS] if effects else []
+        one["channels"] = len(perhaps)
+        one["channel_among"] = truth["channel"] in perhaps
     if truth["joint"] != "all":
         place = _place(effects[0]["where"], effects[0]["strengths"]) if effects else ""
         one["joint"] = any(f"{place} ".startswith(f"{name} ") for name in truth["places"])
@@ -139,6 +143,10 @@ def scores(records: Sequence[Record], *, threshold: float) -> dict[str, Any]:
         "where": {
             "channel": share(r["channel"] for r in sensed),
             "channel_of_right_class": share(r["channel"] for r in sensed if r["top1_class"]),
+            "channel_among_reported": share(r["channel_among"] for r in sensed),
+            "channel_where_one_is_reported": share(
+                r["channel"] for r in sensed if r["channels"] == 1
+            ),
             "joint": share(r["joint"] for r in placed),
             "joint_of_right_class": share(r["joint"] for r in placed if r["top1_class"]),
         },
