@@ -205,7 +205,9 @@ def answered(settings: Recovery, name: str, seed: int) -> dict[str, Any]:
                 pictured["posterior"] = condition(given[-1])
         once = not problem.costly or seed == settings.seed
         if settings.paper_mode and settings.online and once and kind != PAPER:
-            small = Laboratory(problem, paper=settings.paper_mode, environments=100, seed=seed)
+            # chains and rounds are small: where each world costs, few are stepped for nothing
+            width = 250 if problem.environments > 250 else 50
+            small = Laboratory(problem, paper=settings.paper_mode, environments=width, seed=seed)
             alone = lambda t, small=small, columns=columns: small(t)[:, 0, columns]
             mean = given[-1].mean(0)
             for method, answer in online(settings, prior, alone, mean, truth=truth, seed=seed):

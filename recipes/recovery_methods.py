@@ -206,7 +206,9 @@ def mcmc_abc(
     """Return draws by Metropolis chains side by side (Marjoram et al., 2003), shape ``(S, D)``.
 
     A quarter of the budget is a pilot, which sets the scale of the statistics, the tolerance (its
-    5 % quantile of distances), the starts (each of four chains) and the steps of the chains.
+    5 % quantile of distances), the starts (each of four chains) and the steps of the chains. Of
+    distances that are equal, as of a robot that falls as if nothing were varied, the first ones
+    start.
     """
     g = generator(seed, "mcmc")
     theta = draw(prior, budget // 4, key=(seed, "pilot"))
@@ -214,7 +216,8 @@ def mcmc_abc(
     spread = x.std(0).clamp_min(1e-12)
     distance = ((x - observed) / spread).norm(dim=-1)
     tolerance = distance.quantile(ACCEPTED)
-    chain = theta[distance <= tolerance].repeat(4, 1)
+    nearest = distance.argsort(stable=True)[: max(1, int(ACCEPTED * len(theta)))]
+    chain = theta[nearest].repeat(4, 1)
     step = 1.5 * chain.std(0).clamp_min(1e-3)
     kept = []
     for _ in range((budget - len(theta)) // len(chain)):

@@ -10,15 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from importlib import import_module
 from typing import Any
 
-import gymnasium
 import torch
+from bullet_hoppers import BulletHoppers
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torch.nn.functional import one_hot
-from torchrl.envs import Compose, EnvBase, GymWrapper, StepCounter, TransformedEnv
+from torchrl.envs import Compose, EnvBase, StepCounter, TransformedEnv
 
 from torchrl_bayessim.envs.classic_control.acrobot import AcrobotEnv
 from torchrl_bayessim.envs.classic_control.cartpole import CartPoleEnv
@@ -193,24 +192,6 @@ def hopper(environments: int, seed: int) -> EnvBase:
     return BatchedMujocoEnv(task, environments, seed=seed)
 
 
-class GoesOn(gymnasium.Wrapper):
-    """An environment that does not end where its robot has fallen."""
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step; it is not over before its time limit."""
-        observation, reward, _, truncated, info = self.env.step(action)
-        return observation, reward, False, truncated, info
-
-
-def bullet_hopper(environments: int, seed: int) -> EnvBase:
-    """Return PyBullet's Hopper that may fall and goes on, one whatever the number."""
-    import_module("pybullet_envs_gymnasium")
-    del environments
-    env = GymWrapper(GoesOn(gymnasium.make("HopperBulletEnv-v0")))
-    env.set_seed(seed)
-    return env
-
-
 def fetch(task: str, paper: float) -> Problem:
     """Return a Fetch problem: the friction of table and object, one value for both."""
     surfaces = ("geom_friction[body:table0,0]", "geom_friction[object0,0]")
@@ -281,7 +262,7 @@ PROBLEMS: dict[str, Problem] = {
         summaries=(cross_correlation, waypoints(5)),
     ),
     "hopper_pybullet": Problem(
-        simulator=bullet_hopper,
+        simulator=lambda n, seed: BulletHoppers(n, seed=seed),
         prior=BoxPrior({"friction": (0.3, 0.5)}),
         truth={"friction": 0.4},
         physics=lambda: PyBulletPhysics(friction="lateralFriction[floor]"),
@@ -289,7 +270,7 @@ PROBLEMS: dict[str, Problem] = {
         policy=stiffen,
         steps=100,
         episodes=1,
-        environments=1,
+        environments=50,
         costly=True,
         needs="pybullet_envs_gymnasium",
         summaries=(waypoints(10),),

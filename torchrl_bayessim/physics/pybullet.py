@@ -2,7 +2,8 @@
 
 Needs the extra ``pybullet``, and ``import pybullet_envs_gymnasium`` before the environment is
 made. Bullet **multiplies** the lateral frictions of the two bodies in contact (measured: a box
-decelerates at ``μ₁ μ₂ g``), so 0.4 on the floor under a foot of 0.8 acts as 0.32.
+decelerates at ``μ₁ μ₂ g``), so 0.4 on the floor under a foot of 0.8 acts as 0.32. An
+environment that steps several at once has them in a list ``simulators``.
 """
 
 from __future__ import annotations
@@ -52,29 +53,27 @@ class PyBulletPhysics:
     def write(
         self, env: EnvBase, theta: Tensor, *, mask: Tensor, tensordict: TensorDictBase
     ) -> None:
-        """Set the parts' contact parameters."""
+        """Set the parts' contact parameters in the simulators of ``mask``."""
         del tensordict
         nominal = env.__dict__.setdefault("_nominal_contact", {})
-        if mask.all():
-            for group, value in zip(self._targets, theta.tolist(), strict=True):
-                for field, part in group:
-                    nominal.setdefault((field, part), _get(env, field, part))
-                    own = nominal[field, part] if math.isnan(value) else value
-                    bullet, where = _locate(env, part)
-                    bullet.changeDynamics(*where, **{field: own})
+        for i, simulator in enumerate(_simulators(env)):
+            if mask.reshape(-1)[i]:
+                values = theta.reshape(-1, len(self.names))[i].tolist()
+                for group, value in zip(self._targets, values, strict=True):
+                    for field, part in group:
+                        nominal.setdefault((i, field, part), _get(simulator, field, part))
+                        own = nominal[i, field, part] if math.isnan(value) else value
+                        bullet, where = _locate(simulator, part)
+                        bullet.changeDynamics(*where, **{field: own})
 
     def read(self, env: EnvBase, *, tensordict: TensorDictBase) -> Tensor:
-        """Return the parts' values, shape ``(D,)``.
+        """Return the parts' values, shape ``(*batch, D)``.
 
         NaN stands for parts of one parameter that differ; writing it restores them.
         """
         del tensordict
-        values = []
-        for group in self._targets:
-            held = [_get(env, field, part) for field, part in group]
-            same = all(math.isclose(value, held[0], rel_tol=1e-6) for value in held)
-            values.append(held[0] if same else math.nan)
-        return torch.tensor(values, dtype=torch.float64)
+        values = [[_held(one, group) for group in self._targets] for one in _simulators(env)]
+        return torch.tensor(values, dtype=torch.float64).reshape(*env.batch_size, -1)
 
 
 def _parse(target: str) -> tuple[str, str]:
@@ -84,17 +83,30 @@ def _parse(target: str) -> tuple[str, str]:
     return match[1], match[2]
 
 
-def _get(env: EnvBase, field: str, part: str) -> float:
-    bullet, where = _locate(env, part)
+def _simulators(env: EnvBase) -> list[Any]:
+    """Return the simulators inside: those of an environment of many, or the one."""
+    inside = simulator_of(env)
+    return vars(inside).get("simulators", [inside])
+
+
+def _held(simulator: Any, group: list[tuple[str, str]]) -> float:
+    """Return the value that all parts of a group have; NaN if they differ."""
+    held = [_get(simulator, field, part) for field, part in group]
+    same = all(math.isclose(value, held[0], rel_tol=1e-6) for value in held)
+    return held[0] if same else math.nan
+
+
+def _get(simulator: Any, field: str, part: str) -> float:
+    bullet, where = _locate(simulator, part)
     return bullet.getDynamicsInfo(*where)[_FIELDS[field]]
 
 
-def _locate(env: EnvBase, part: str) -> tuple[Any, tuple[int, int]]:
+def _locate(simulator: Any, part: str) -> tuple[Any, tuple[int, int]]:
     """Return the client, and the part's body and link; the first reset builds the world."""
-    inside = simulator_of(env)
-    if not hasattr(inside, "parts"):
-        inside.reset()
-    if part not in inside.parts:
-        raise PhysicsError(message("a part of the scene", part, available=sorted(inside.parts)))
-    found = inside.parts[part]
-    return inside._p, (found.bodies[found.bodyIndex], found.bodyPartIndex)
+    if not hasattr(simulator, "parts"):
+        simulator.reset()
+    if part not in simulator.parts:
+        available = sorted(simulator.parts)
+        raise PhysicsError(message("a part of the scene", part, available=available))
+    found = simulator.parts[part]
+    return simulator._p, (found.bodies[found.bodyIndex], found.bodyPartIndex)
