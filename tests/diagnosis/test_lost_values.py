@@ -18,7 +18,8 @@ from torchrl_bayessim.diagnosis.loss_suspects import Alone, _explained
 from torchrl_bayessim.diagnosis.losses import _found
 from torchrl_bayessim.diagnosis.model import Model
 from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
-from torchrl_bayessim.effects.sensors import SensorDropout
+from torchrl_bayessim.effects.joints import CoulombFriction
+from torchrl_bayessim.effects.sensors import SensorDropout, SensorGain
 from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.system import System
@@ -154,14 +155,17 @@ def test_friction_and_samples_that_are_not_renewed_are_both_named():
     assert low <= explained(report) <= high
 
 
-def short_segments(rng, *, lost, spoiled, count=60, steps=8):
-    """Segments that noise alone is in, and some with a lost value or spoiled by something else."""
+def short_segments(rng, *, lost, spoiled, left=0.0, count=60, steps=8):
+    """Segments that noise alone is in, and some with a lost value or spoiled by something else.
+
+    Of the eight variances of noise that a lost value adds some may be left with the right pattern.
+    """
     tried = np.tile(rng.chisquare(16, count) / 16, (1 + steps, 1))
     tried[1:] += 2.0
     tried[:, :spoiled] += 20.0
     for s in range(spoiled, spoiled + lost):
         tried[0, s] += 8.0
-        tried[1 + rng.integers(steps), s] -= 2.0
+        tried[1 + rng.integers(steps), s] -= 2.0 - left
     patterns = Tried(tried, np.r_[0, np.ones(steps, dtype=int)], values=steps)
     return SimpleNamespace(
         tried=lambda unit: patterns, without=patterns.without, left=np.zeros((count, 16))
@@ -169,28 +173,55 @@ def short_segments(rng, *, lost, spoiled, count=60, steps=8):
 
 
 @pytest.mark.parametrize(
-    ("lost", "spoiled", "beside", "found"),
+    ("lost", "spoiled", "other", "found"),
     [
-        ((12, 12), 3, True, True),
-        ((6, 6), 14, True, True),  # clear, whatever spoils a quarter of the segments
-        ((6, 6), 14, False, False),  # something is wrong that may look like losses
-        ((12, 12), 22, True, False),
-        ((24, 0), 3, True, True),  # a burst in the runs of the fit
-        ((24, 0), 3, False, False),
-        ((0, 0), 14, True, False),
+        ((12, 12), 3, CoulombFriction, True),
+        ((6, 6), 14, CoulombFriction, True),  # clear, whatever spoils a quarter of the segments
+        ((6, 6), 14, None, False),  # something is wrong that may look like losses
+        ((12, 12), 22, CoulombFriction, False),
+        ((24, 0), 3, CoulombFriction, True),  # a burst in the runs of the fit
+        ((24, 0), 3, None, False),
+        ((0, 0), 14, CoulombFriction, False),
+        ((6, 6), 14, SensorGain, True),
+        ((0, 0), 14, SensorGain, False),
     ],
 )  # fmt: skip
 def test_losses_beside_an_effect_that_explain_what_they_spoil_are_found(
-    lost, spoiled, beside, found
+    lost, spoiled, other, found
 ):
     rng = np.random.default_rng(0)
     counts = dict(zip(("train", "validation", "test"), (*lost, 12), strict=True))
     data = {n: short_segments(rng, lost=k, spoiled=spoiled) for n, k in counts.items()}
-    unit = SimpleNamespace(effect=SensorDropout(), high=0.5)
-    chance = _found(data, unit, Alone.of(data), beside=beside)
+    chance = losses_beside(data, other)
     assert (chance is not None) == found
     if found:
         assert chance.strength == pytest.approx(sum(lost) / 2 / (60 - spoiled) / 8, rel=0.5)
+
+
+def losses_beside(data, other):
+    unit = SimpleNamespace(effect=SensorDropout(), high=0.5)
+    others = () if other is None else (SimpleNamespace(effect=other()),)
+    return _found(data, unit, Alone.of(data), others)
+
+
+def test_what_losses_leave_speaks_against_them_where_another_law_of_a_sensor_would_leave_it():
+    rng = np.random.default_rng(0)
+    counts = {"train": 6, "validation": 6, "test": 6}
+    data = {n: short_segments(rng, lost=k, spoiled=3, left=1.5) for n, k in counts.items()}
+    assert losses_beside(data, CoulombFriction) is not None
+    assert losses_beside(data, SensorGain) is None
+
+
+def test_samples_of_one_sensor_are_lost_beside_another_sensors_gain():
+    rng = np.random.default_rng(6)
+    data = [replace(log, qvel=0.85 * log.qvel) for log in logs(8)]
+    data = [shown_again(log, 0.1, rng) for log in data]
+    report = diagnose(system(), None, data, effects=[*SOME, "sensor_gain", "action_gain"])
+    found = {effect.name: effect for effect in report.effects}
+    assert set(found) == {"sensor_gain", "sensor_dropout"}
+    assert found["sensor_gain"].where == "hinge velocity"
+    assert found["sensor_gain"].strength == pytest.approx(-0.15, rel=0.2)
+    assert found["sensor_dropout"].strength == pytest.approx(0.1, rel=0.5)
 
 
 def test_losses_are_not_tried_where_an_effect_that_lasts_leaves_noise_alone(monkeypatch):

@@ -136,7 +136,7 @@ def lost_beside(seen: Evident, model: Model) -> Chance | None:
     if not _apart(model.units):
         return None
     data = {name: one.at(model.fit.point) for name, one in seen.segments.items()}
-    return _found(data, seen.unit, Alone.of(data), beside=True)
+    return _found(data, seen.unit, Alone.of(data), model.units)
 
 
 def losses(prepared: Prepared, selection: Selection, suspects: Suspects) -> list[Chance]:
@@ -156,7 +156,7 @@ def losses(prepared: Prepared, selection: Selection, suspects: Suspects) -> list
     # what the best explanation without chance gains by the same standard
     found, least = _all_found(nominal, some, alone), sum(alone.costs) - sum(rival.costs)
     if selection.best.units and _apart(selection.best.units):
-        others = _all_found(best, some, rival, beside=True)
+        others = _all_found(best, some, rival, selection.best.units)
         beside = [replace(one, beside=True) for one in others]
         if _most(beside) > _most(found) - least + _NEEDED:
             found, least = beside, 0.0
@@ -177,18 +177,29 @@ def _apart(others: Sequence[Unit]) -> bool:
     """Return whether losses beside effects could not be another form of those.
 
     A lag that is not quite the true one, and contacts that stick and slip a little otherwise, err
-    as samples and commands would that were lost; so do sensors, but by a constant or a slow drift.
+    as samples and commands would that were lost.
     """
     known = [unit.effect for unit in others]
     late = any(e.group == "timing" for e in known)
-    moving = any(e.channel == "sensing" and e.group != SensorBias.group for e in known)
-    return not late and not moving and not any(isinstance(e, ContactFriction) for e in known)
+    return not late and not any(isinstance(e, ContactFriction) for e in known)
+
+
+def _sensed(others: Sequence[Unit]) -> bool:
+    """Return whether effects are of sensors, and more than a constant or a slow drift.
+
+    Samples err with these as if a few were lost; they have to be clearly.
+    """
+    known = [unit.effect for unit in others]
+    return any(e.channel == "sensing" and e.group != SensorBias.group for e in known)
 
 
 def _all_found(
-    data: Mapping[str, LossSegments], units: Sequence[Unit], alone: Alone, *, beside: bool = False
+    data: Mapping[str, LossSegments],
+    units: Sequence[Unit],
+    alone: Alone,
+    others: Sequence[Unit] = (),
 ) -> list[Chance]:
-    found = [_found(data, unit, alone, beside=beside) for unit in units]
+    found = [_found(data, unit, alone, others) for unit in units]
     return [one for one in found if one is not None]
 
 
@@ -197,9 +208,9 @@ def _most(found: Sequence[Chance]) -> float:
 
 
 def _found(
-    data: Mapping[str, LossSegments], unit: Unit, alone: Alone, *, beside: bool
+    data: Mapping[str, LossSegments], unit: Unit, alone: Alone, others: Sequence[Unit]
 ) -> Chance | None:
-    """Return the losses of a unit, nothing if they do not explain what they spoil.
+    """Return the losses of a unit beside others, nothing if they do not explain what they spoil.
 
     Commands beside an effect have to stand out, or to leave nothing of what they spoil: a force law
     that is not quite the true one errs everywhere a little, as if ever so many of them were lost.
@@ -213,7 +224,7 @@ def _found(
         return None
     told = {name: law.told(one) for name, one in tried.items()}
     known = Told.joined([told[name] for name in JUDGED])
-    if not _explain(law, known, gains, alone=alone, unit=unit, beside=beside):
+    if not _explain(law, known, gains, alone=alone, unit=unit, others=others):
         return None
     share, low, high = np.minimum(law.share_within(judged), unit.high)
     shown = told["test"]
@@ -232,7 +243,13 @@ def _found(
 
 
 def _explain(
-    law: LossLaw, known: Told, gains: Sequence[float], *, alone: Alone, unit: Unit, beside: bool
+    law: LossLaw,
+    known: Told,
+    gains: Sequence[float],
+    *,
+    alone: Alone,
+    unit: Unit,
+    others: Sequence[Unit],
 ) -> bool:
     """Return whether losses explain the segments that have them, and little else is wrong."""
     concerned = known.lost > LIKELIER
@@ -242,7 +259,9 @@ def _explain(
         float((e[concerned] - law.scatter).mean()) for e in (known.before, known.after)
     )
     clear = sum(gains) > _EVIDENT and after < _CLEARLY * before
-    surely = beside and clear
+    if _sensed(others) and not clear:
+        return False
+    surely = bool(others) and clear
     # where losses come in bursts, the runs that judge may have had hardly any
     if gains[1] < -max(_LIKELY, _FEW * gains[0] if surely else 0.0):
         return False
@@ -254,4 +273,4 @@ def _explain(
     if after > _EXPLAINED * before:
         return False
     faint = law.share > unit.high or (before < _STANDS_OUT and not clear)
-    return not (beside and isinstance(unit.effect, PacketDrop) and faint)
+    return not (others and isinstance(unit.effect, PacketDrop) and faint)
