@@ -195,7 +195,7 @@ def test_which_commands_arrived_is_decided_on_again_while_that_helps(monkeypatch
     where = "torchrl_bayessim.diagnosis.lost_commands."
     arrivals = SimpleNamespace(decided=lambda logs: logs)
     monkeypatch.setattr(where + "Arrivals", lambda *_: arrivals)
-    monkeypatch.setattr(where + "with_other_commands", lambda *_, **__: None)
+    monkeypatch.setattr(where + "with_other_logs", lambda *_, **__: None)
     law = LossLaw(share=0.2, scatter=1.0, spoiled=0.01, size=16)
     seen = SimpleNamespace(point=Point(np.zeros(1)), law=law, actuators=[0])
     sent = SimpleNamespace(best=plain([], 400 * 100.0))

@@ -15,7 +15,7 @@ from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.found import _matters as found_matters
 from torchrl_bayessim.diagnosis.loss_law import LossLaw, Tried, likeliest
 from torchrl_bayessim.diagnosis.loss_suspects import Alone, _explained
-from torchrl_bayessim.diagnosis.losses import _found
+from torchrl_bayessim.diagnosis.losses import found_beside
 from torchrl_bayessim.diagnosis.model import Model
 from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
 from torchrl_bayessim.effects.joints import CoulombFriction
@@ -201,7 +201,7 @@ def test_losses_beside_an_effect_that_explain_what_they_spoil_are_found(
 def losses_beside(data, other):
     unit = SimpleNamespace(effect=SensorDropout(), high=0.5)
     others = () if other is None else (SimpleNamespace(effect=other()),)
-    return _found(data, unit, Alone.of(data), others)
+    return found_beside(data, unit, Alone.of(data), others)
 
 
 def test_what_losses_leave_speaks_against_them_where_another_law_of_a_sensor_would_leave_it():
@@ -225,7 +225,7 @@ def test_samples_of_one_sensor_are_lost_beside_another_sensors_gain():
 
 
 def test_losses_are_not_tried_where_an_effect_that_lasts_leaves_noise_alone(monkeypatch):
-    monkeypatch.setattr("torchrl_bayessim.diagnosis.losses._found", pytest.fail)
+    monkeypatch.setattr("torchrl_bayessim.diagnosis.losses.found_beside", pytest.fail)
     data = logs(6, push=lambda _, v: -0.15 * np.tanh(v / 0.02))
     report = diagnose(system(), None, data, effects=SOME)
     assert [effect.name for effect in report.effects] == ["coulomb_friction"]

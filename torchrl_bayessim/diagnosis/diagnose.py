@@ -33,13 +33,14 @@ from .late_sensors import LATE, free_riders, without_free_riders
 from .loss_suspects import Suspects
 from .losses import losses
 from .lost_commands import beside_lost_commands
+from .lost_samples import beside_lost_samples
 from .modes import MODES
 from .objective import Point, Unit, pushes_of, units_of
 from .onsets import with_onsets
 from .preparation import Prepared, prepare
 from .prepared_anew import with_less_noise
 from .report import Report
-from .scatter import Scatter, Sent, gap_with_holds
+from .scatter import Scatter, gap_with_holds
 from .selection import Selection, select
 from .shapes import SHAPED, shaped, with_shapes
 
@@ -123,28 +124,26 @@ def diagnose(
         sent, recorded = None, 1.0
         if holds:
             recorded = gap_with_holds(prepared, logs, selection)
-        elif suspects and (
-            beside := beside_lost_commands(
-                replace(prepared, alarms=alarms),
-                selection,
-                found,
-                suspects=suspects,
-                search=search,
-                generator=generator,
-            )
-        ):
-            selection, found = beside.selection, [beside.chance]
-            sent = Sent.along(beside.prepared, beside.sent, selection)
-            prepared = beside.prepared.alarmed(sent.note)
+        elif suspects:
+            seen = replace(prepared, alarms=alarms), selection, found
+            lost = {"suspects": suspects, "search": search, "generator": generator}
+            if beside := beside_lost_commands(*seen, **lost) or beside_lost_samples(*seen, **lost):
+                prepared, selection, found, sent = beside.told()
         found = found or chances(prepared.sets, selection, random)
         hidden = [] if found else unseen(prepared.sets, selection, random)
-        least = detectable(prepared.sets["train"], selection, random)
         progress("opening the test runs")
         return assemble(
             system,
             prepared=prepared,
             selection=selection,
-            scatter=Scatter(found, least, holds, recorded, hidden, sent),
+            scatter=Scatter(
+                found,
+                detectable(prepared.sets["train"], selection, random),
+                holds,
+                recorded,
+                hidden,
+                sent,
+            ),
             findings=findings,
             generator=generator,
             begun=begun,

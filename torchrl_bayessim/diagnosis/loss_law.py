@@ -119,7 +119,7 @@ class LossLaw:
 
     def told(self, tried: Tried) -> Told:
         """Return what segments say of their losses."""
-        likely = softmax(self._logs(tried), axis=0)
+        likely = self.likely(tried)
         every = np.concatenate([tried.squares, tried.squares[:1]])
         return Told(
             lost=likely[1:-1].sum(0),
@@ -128,6 +128,10 @@ class LossLaw:
             before=tried.squares[0],
             after=(likely * every).sum(0),
         )
+
+    def likely(self, tried: Tried) -> Array:
+        """Return how likely each pattern is, and last that a segment is spoiled, ``(B + 1, S)``."""
+        return np.asarray(softmax(self._logs(tried), axis=0))
 
     def _logs(self, tried: Tried) -> Array:
         """Return log densities of every pattern and of spoiled segments, shape ``(B + 1, S)``."""

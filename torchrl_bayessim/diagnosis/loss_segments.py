@@ -7,7 +7,7 @@ what happened, whatever the drive does with commands. Those of samples are the s
 
 from __future__ import annotations
 
-__all__ = ["LossSegments", "command_slopes", "loss_segments"]
+__all__ = ["STEPS", "LossSegments", "command_slopes", "loss_segments"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,14 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..effects.action import PacketDrop
-from .loss_law import Tried
+from .loss_law import LossLaw, Tried
 from .objective import Objective, Point, Unit, strengths_of
 from .preparation import Prepared
 from .segments import cut
 
 Array = NDArray[np.float64]
 Patterns = Sequence[tuple[bool, ...]]
-_STEPS = 8  # of a segment
+STEPS = 8  # of a segment
 _TOGETHER = 4  # losses in a segment, at most
 _MOST = {"train": 90, "validation": 45, "test": 45}  # segments
 _NUDGE, _SAME = 0.2, 0.01  # of the largest command, and of that: a change that is none
@@ -70,6 +70,11 @@ class LossSegments:
         columns, changes = (np.concatenate(part, -1) for part in zip(*parts, strict=True))
         squares = _squares(self.left, columns, changes)
         return Tried(squares, np.array([sum(p) for p in patterns]), len(patterns[0]))
+
+    def lost(self, unit: Unit, law: LossLaw) -> Array:
+        """Return how likely each sample of a unit was lost, the start's first, ``(S, 1 + H)``."""
+        patterns = np.array(_patterns(1 + self.objective.segments.horizon))
+        return law.likely(self.tried(unit))[:-1].T @ patterns.astype(np.float64)
 
     @cached_property
     def _known(self) -> dict[int, Array]:
@@ -153,7 +158,7 @@ def loss_segments(prepared: Prepared) -> dict[str, LossSegments]:
     history = max(prepared.sets["train"].segments.history, 1)
     found = {}
     for name, logs in prepared.logs.items():
-        pieces = cut(logs, _STEPS, history=history, most=_MOST[name], burn_in=history)
+        pieces = cut(logs, STEPS, history=history, most=_MOST[name], burn_in=history)
         objective = prepared.mode.objective(
             prepared.predictor, prior, pieces, z=point.z, noise=prepared.noise
         )

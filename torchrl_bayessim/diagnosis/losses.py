@@ -10,7 +10,7 @@ place of the effects that the search found, and beside them.
 
 from __future__ import annotations
 
-__all__ = ["Evident", "evident", "losses", "lost_beside"]
+__all__ = ["Evident", "evident", "found_beside", "losses", "lost_beside"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -136,7 +136,7 @@ def lost_beside(seen: Evident, model: Model) -> Chance | None:
     if not _apart(model.units):
         return None
     data = {name: one.at(model.fit.point) for name, one in seen.segments.items()}
-    return _found(data, seen.unit, Alone.of(data), model.units)
+    return found_beside(data, seen.unit, Alone.of(data), model.units)
 
 
 def losses(prepared: Prepared, selection: Selection, suspects: Suspects) -> list[Chance]:
@@ -199,7 +199,7 @@ def _all_found(
     alone: Alone,
     others: Sequence[Unit] = (),
 ) -> list[Chance]:
-    found = [_found(data, unit, alone, others) for unit in units]
+    found = [found_beside(data, unit, alone, others) for unit in units]
     return [one for one in found if one is not None]
 
 
@@ -207,7 +207,7 @@ def _most(found: Sequence[Chance]) -> float:
     return max((one.gain for one in found), default=0.0)
 
 
-def _found(
+def found_beside(
     data: Mapping[str, LossSegments], unit: Unit, alone: Alone, others: Sequence[Unit]
 ) -> Chance | None:
     """Return the losses of a unit beside others, nothing if they do not explain what they spoil.

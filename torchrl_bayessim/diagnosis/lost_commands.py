@@ -9,7 +9,7 @@ have them in that simulator, by the standard that is theirs elsewhere (`losses`)
 
 from __future__ import annotations
 
-__all__ = ["Beside", "beside_lost_commands"]
+__all__ = ["CERTAIN", "Beside", "beside_lost_commands"]
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -23,11 +23,12 @@ from .loss_suspects import Suspects
 from .losses import Evident, evident, lost_beside
 from .model import WHITE
 from .preparation import Prepared
-from .prepared_anew import with_other_commands
+from .prepared_anew import with_other_logs
+from .scatter import Sent
 from .selection import Selection
 
 _ROUNDS = 3  # of deciding which commands arrived and searching on
-_CERTAIN = 40.0  # deviance by which both together have to explain more than either
+CERTAIN = 40.0  # deviance by which both together have to explain more than either
 _HALF = 0.5  # of what parameters leave of the commands that arrived
 _LARGEST = 1_000_000  # control steps simulated to decide on all commands
 _SOME = "which commands arrived was decided on in {} of {} runs: all would have taken long"
@@ -36,11 +37,11 @@ _SIMULATED = 18  # for each row and actuator
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """What was found on the commands that arrived.
+    """What was found on the commands that arrived, or on samples that were not lost.
 
     Attributes:
-        sent: The runs that were looked at, with the commands that were sent.
-        prepared: With those that arrived.
+        sent: The runs that were looked at, with the commands that were sent, or as recorded.
+        prepared: With those that arrived, or with others in the place of those that were lost.
         selection: The effects that last.
         chance: The losses.
     """
@@ -49,6 +50,11 @@ class Beside:
     prepared: Prepared
     selection: Selection
     chance: Chance
+
+    def told(self) -> tuple[Prepared, Selection, list[Chance], Sent]:
+        """Return what a report is made of, with an alarm that says on what it was found."""
+        sent = Sent.along(self.prepared, self.sent, self.selection)
+        return self.prepared.alarmed(sent.note), self.selection, [self.chance], sent
 
 
 def beside_lost_commands(
@@ -78,9 +84,9 @@ def beside_lost_commands(
     if best is None:
         return None
     lasting, chance = _needed(seen, *best)
-    if chance is None or chance.deviance > seen.without - _CERTAIN:
+    if chance is None or chance.deviance > seen.without - CERTAIN:
         return None
-    if any(chance.deviance > one.deviance - _CERTAIN for one in found):
+    if any(chance.deviance > one.deviance - CERTAIN for one in found):
         return None
     return Beside(some, best[0], lasting, replace(chance, beside=True))
 
@@ -98,7 +104,7 @@ def _needed(
         found = [(lost_beside(seen, model), model) for model in smaller]
         known = [(one.deviance, one, model) for one, model in found if one is not None]
         least, one, model = min(known, key=lambda each: each[0], default=(np.inf, chance, None))
-        if model is None or (chance is not None and least > chance.deviance + _CERTAIN):
+        if model is None or (chance is not None and least > chance.deviance + CERTAIN):
             break
         chance = one
         selection = selection.reduced(model, smaller)
@@ -139,7 +145,7 @@ def _searched(
     result, least = None, sent.best.mean_square
     for _ in range(_ROUNDS):
         logs = Arrivals(prepared, point, seen.actuators, law).decided(logs)
-        again = with_other_commands(prepared, logs, generator=generator)
+        again = with_other_logs(prepared, logs, generator=generator)
         again, selection = search(again)
         if not selection.best.units or selection.best.mean_square >= least:
             break

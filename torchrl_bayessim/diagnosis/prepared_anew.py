@@ -1,8 +1,8 @@
-"""What a search starts from once it is known what else there is: other commands, or less noise."""
+"""What a search starts from once it is known what else there is: other logs, or less noise."""
 
 from __future__ import annotations
 
-__all__ = ["with_less_noise", "with_other_commands"]
+__all__ = ["with_less_noise", "with_other_logs"]
 
 from collections.abc import Mapping, Sequence
 
@@ -17,19 +17,19 @@ from .preparation import Prepared, Started
 _QUIETER = 0.87  # times the noise: a quarter of its variance was the missing effect
 
 
-def with_other_commands(
+def with_other_logs(
     prepared: Prepared,
     parts: Mapping[str, Sequence[Log]],
     *,
     generator: np.random.Generator,
 ) -> Prepared:
-    """Return what a search starts from if other commands arrived than those that were sent.
+    """Return what a search starts from if other commands arrived, or other samples were taken.
 
-    Over the same horizon, with a noise of its own: what commands spoil that were lost is none.
+    Over the same horizon, with a noise of its own: what values spoil that were lost is none.
 
     Args:
-        prepared: With the commands that were sent.
-        parts: The logs of each split with those that arrived.
+        prepared: With the logs as they were recorded.
+        parts: The same logs of each split, with those.
         generator: As in `prepare`.
     """
     history, mode = prepared.sets["train"].segments.history, prepared.mode

@@ -55,14 +55,16 @@ def _along(test: Objective, pieces: Segments, points: Sequence[Point]) -> NDArra
 class Sent:
     """Mean squared innovations of test segments with the commands that were sent.
 
-    Where others are taken to have arrived, on which everything else is compared.
+    Where others are taken to have arrived, on which everything else is compared; or of samples as
+    they were recorded, where those that were lost are interpolated.
 
     Attributes:
         raw: At the prior's mean.
         refit: With fitted parameters.
         effects: With the effects that last too.
-        lost: How many commands of all runs are taken to have been lost.
+        lost: How many commands, or samples, of all runs are taken to have been lost.
         of: How many there are.
+        samples: Whether they are samples.
     """
 
     raw: float
@@ -70,6 +72,7 @@ class Sent:
     effects: float
     lost: int
     of: int
+    samples: bool = False
 
     @classmethod
     def along(cls, prepared: Prepared, sent: Prepared, selection: Selection) -> Sent:
@@ -89,9 +92,17 @@ class Sent:
             for name, part in sent.logs.items()
             for pair in zip(part, prepared.logs[name], strict=True)
         ]
-        lost = sum(int((one.ctrl != other.ctrl).any(1).sum()) for one, other in logs)
+        counts = [
+            sum(
+                int((getattr(one, name) != getattr(other, name)).any(1).sum())
+                for one, other in logs
+            )
+            for name in ("ctrl", "qpos", "qvel")  # a velocity may be estimated from positions
+        ]
+        lost = next((count for count in counts if count), 0)
         raw, refit, effects = _along(test, pieces, points).tolist()
-        return cls(raw, refit, effects, lost, sum(len(one) for one, _ in logs))
+        rows = sum(len(one) for one, _ in logs)
+        return cls(raw, refit, effects, lost, rows, samples=not counts[0])
 
     def share(self, arrived: Shrinkage) -> float:
         """Return the share of the gap that losses have of what they and the effects remove.
@@ -113,6 +124,12 @@ class Sent:
     @property
     def note(self) -> str:
         """What the reader must know."""
+        if self.samples:
+            return (
+                f"{self.lost} of {self.of} samples are taken to have been lost, and interpolated; "
+                "the gap without causes is of the logs as recorded, all else, of test runs too, "
+                "of those with the interpolated"
+            )
         return (
             f"{self.lost} of {self.of} commands are taken to have been lost; the gap without "
             "causes is of those that were sent, all else, of test runs too, of those that arrived"
