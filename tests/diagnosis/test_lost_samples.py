@@ -2,12 +2,17 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 import torch
+from test_lost_values import TWO, run_of_two
 
+from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.lost_samples import _interpolated
+from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.logs.log import Log
+from torchrl_bayessim.logs.system import System
 from torchrl_bayessim.logs.velocity import Windows, velocity
 
 
@@ -62,3 +67,41 @@ def test_logs_of_which_nothing_or_nearly_everything_is_lost_stay():
     log, _, lost = wave(estimated=False)
     assert _interpolated(log, np.zeros_like(lost), 0) is log
     assert _interpolated(log, ~np.zeros_like(lost), 0) is log
+
+
+def second_angle_shown_again(log, share, rng):
+    angles = log.qpos.clone()
+    for k in range(1, len(angles)):
+        if rng.random() < share:
+            angles[k, 1] = angles[k - 1, 1]
+    return replace(log, qpos=angles + torch.from_numpy(rng.normal(scale=2e-4, size=angles.shape)))
+
+
+def test_a_gain_that_lost_samples_hide_is_found_beside_them():
+    """Three per cent of a command do less than an angle that is a step late, now and then."""
+    rng = np.random.default_rng(8)
+    gain = np.array([1.03, 1.0])
+    data = [run_of_two(rng, f"run{i}", share=0.0, through=lambda u: u * gain) for i in range(6)]
+    data = [second_angle_shown_again(log, 0.12, rng) for log in data]
+    robot = System(task=Task(model=mujoco.MjModel.from_xml_string(TWO), frame_skip=1))
+    some = "sensor_dropout", "action_gain", "coulomb_friction", "action_lag"
+    report = diagnose(robot, None, data, effects=some)
+    found = {effect.name: effect for effect in report.effects}
+    assert set(found) == {"action_gain", "sensor_dropout"}
+    assert (found["action_gain"].where, found["sensor_dropout"].where) == ("one", "second position")
+    assert found["action_gain"].strength == pytest.approx(0.03, abs=0.01)
+    assert found["sensor_dropout"].strength == pytest.approx(0.12, rel=0.3)
+    (note,) = (alarm for alarm in report.alarms if "interpolated" in alarm)
+    assert "of 900 samples are taken to have been lost" in note
+    assert report.gap.with_effects < 1.3 < report.gap.refit
+
+
+def test_no_sample_is_replaced_where_losses_are_all_there_is():
+    rng = np.random.default_rng(8)
+    data = [run_of_two(rng, f"run{i}", share=0.0) for i in range(6)]
+    data = [second_angle_shown_again(log, 0.12, rng) for log in data]
+    robot = System(task=Task(model=mujoco.MjModel.from_xml_string(TWO), frame_skip=1))
+    some = "sensor_dropout", "action_gain", "coulomb_friction", "action_lag"
+    report = diagnose(robot, None, data, effects=some)
+    assert [effect.name for effect in report.effects] == ["sensor_dropout"]
+    assert not any("interpolated" in alarm for alarm in report.alarms)
