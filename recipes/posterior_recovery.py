@@ -91,10 +91,12 @@ def job(settings: Recovery, out: Path) -> dict[str, Any]:
     todo = [(name, seed) for seed in seeds for name in names]
     folder = out / "parts"
     with workers(settings.processes, threads=settings.threads) as pool:
-        jobs = [pool.submit(run, settings, name, seed, folder) for name, seed in todo]
+        # the long ones first, so that no worker is left alone with one
+        queue = sorted(todo, key=lambda one: not PROBLEMS[one[0]].costly)
+        jobs = {one: pool.submit(run, settings, *one, folder) for one in queue}
         parts = []
-        for (name, seed), done in zip(todo, jobs, strict=True):
-            parts.append(done.result())
+        for name, seed in todo:
+            parts.append(jobs[name, seed].result())
             print(f"{name}, seed {seed}: {parts[-1]['seconds']:.0f} s")
     result = {
         "paper_mode": settings.paper_mode,

@@ -14,7 +14,7 @@ from test_lost_values import TWO, run_of_two
 from torchrl_bayessim.diagnosis.arrivals import Arrivals
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.loss_law import LossLaw
-from torchrl_bayessim.diagnosis.losses import _apart, evident
+from torchrl_bayessim.diagnosis.losses import _apart, _sensed, evident
 from torchrl_bayessim.diagnosis.lost_commands import _matters, _searched, beside_lost_commands
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.preparation import prepare
@@ -206,9 +206,11 @@ def test_which_commands_arrived_is_decided_on_again_while_that_helps(monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("name", "apart"),
-    [("dead_band", True), ("sensor_bias", True), ("sensor_drift", True), ("sensor_gain", False),
-     ("sensor_lag", False), ("action_delay", False)],
+    ("name", "apart", "sensed"),
+    [("dead_band", True, False), ("sensor_bias", True, False), ("sensor_drift", True, False),
+     ("sensor_gain", True, True), ("sensor_lag", False, True), ("action_delay", False, False)],
 )  # fmt: skip
-def test_losses_are_not_told_beside_what_errs_as_they_do(name, apart):
-    assert _apart(units_of([effect(name)], system().robot)) == apart
+def test_losses_are_not_told_beside_what_errs_as_they_do(name, apart, sensed):
+    units = units_of([effect(name)], system().robot)
+    assert _apart(units) == apart
+    assert _sensed(units) == sensed  # where they have to be clear
