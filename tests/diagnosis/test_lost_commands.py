@@ -1,5 +1,6 @@
 """Effects that last are found beside commands that were lost, on those that arrived."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import mujoco
@@ -133,11 +134,9 @@ def test_the_search_is_not_done_again_where_no_losses_are_evident(monkeypatch):
 
     seen = []
 
-    def watched(prepared, selection, found, **others):
-        seen.append(selection.best.mean_square)
-        assert (
-            beside_lost_commands(prepared, selection, found, **{**others, "search": search}) is None
-        )
+    def watched(sought):
+        seen.append(sought.selection.best.mean_square)
+        assert beside_lost_commands(replace(sought, search=search)) is None
 
     monkeypatch.setattr("torchrl_bayessim.diagnosis.diagnose.beside_lost_commands", watched)
     data = logs(6, push=lambda q, v: -0.4 * np.tanh(v / 0.3) * (1 + np.sin(9 * q)))

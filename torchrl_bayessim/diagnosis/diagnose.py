@@ -27,6 +27,7 @@ from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
 from ..physics.mujoco import MujocoPhysics
 from .assembly import assemble
+from .beside_losses import Sought
 from .chance import chances, detectable, of_chance, unseen
 from .holds import bridged
 from .late_sensors import LATE, free_riders, without_free_riders
@@ -125,9 +126,9 @@ def diagnose(
         if holds:
             recorded = gap_with_holds(prepared, logs, selection)
         elif suspects:
-            seen = replace(prepared, alarms=alarms), selection, found
-            lost = {"suspects": suspects, "search": search, "generator": generator}
-            if beside := beside_lost_commands(*seen, **lost) or beside_lost_samples(*seen, **lost):
+            seen = replace(prepared, alarms=alarms)
+            sought = Sought(seen, selection, found, suspects, search, generator)
+            if beside := beside_lost_commands(sought) or beside_lost_samples(sought):
                 prepared, selection, found, sent = beside.told()
         found = found or chances(prepared.sets, selection, random)
         hidden = [] if found else unseen(prepared.sets, selection, random)

@@ -9,78 +9,38 @@ have them in that simulator, by the standard that is theirs elsewhere (`losses`)
 
 from __future__ import annotations
 
-__all__ = ["CERTAIN", "Beside", "beside_lost_commands"]
+__all__ = ["beside_lost_commands"]
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from .arrivals import Arrivals
+from .beside_losses import CERTAIN, Beside, Sought
 from .chance import Chance
 from .elimination import parts
-from .loss_suspects import Suspects
 from .losses import Evident, evident, lost_beside
 from .model import WHITE
 from .preparation import Prepared
 from .prepared_anew import with_other_logs
-from .scatter import Sent
 from .selection import Selection
 
 _ROUNDS = 3  # of deciding which commands arrived and searching on
-CERTAIN = 40.0  # deviance by which both together have to explain more than either
 _HALF = 0.5  # of what parameters leave of the commands that arrived
 _LARGEST = 1_000_000  # control steps simulated to decide on all commands
 _SOME = "which commands arrived was decided on in {} of {} runs: all would have taken long"
 _SIMULATED = 18  # for each row and actuator
 
 
-@dataclass(frozen=True, eq=False)
-class Beside:
-    """What was found on the commands that arrived, or on samples that were not lost.
-
-    Attributes:
-        sent: The runs that were looked at, with the commands that were sent, or as recorded.
-        prepared: With those that arrived, or with others in the place of those that were lost.
-        selection: The effects that last.
-        chance: The losses.
-    """
-
-    sent: Prepared
-    prepared: Prepared
-    selection: Selection
-    chance: Chance
-
-    def told(self) -> tuple[Prepared, Selection, list[Chance], Sent]:
-        """Return what a report is made of, with an alarm that says on what it was found."""
-        sent = Sent.along(self.prepared, self.sent, self.selection)
-        return self.prepared.alarmed(sent.note), self.selection, [self.chance], sent
-
-
-def beside_lost_commands(
-    prepared: Prepared,
-    selection: Selection,
-    found: Sequence[Chance],
-    *,
-    suspects: Suspects,
-    search: Callable[[Prepared], tuple[Prepared, Selection]],
-    generator: np.random.Generator,
-) -> Beside | None:
-    """Return effects that last and losses that explain more together than what was found.
-
-    Args:
-        prepared: Logs with the commands that were sent.
-        selection: The effects that last, found with those.
-        found: What was found of losses, beside them or in their place.
-        suspects: Short segments in which commands may have been lost.
-        search: Searches for effects that last.
-        generator: Of simulated noise.
-    """
-    seen = evident(suspects, selection, found)
+def beside_lost_commands(sought: Sought) -> Beside | None:
+    """Return effects that last and losses that explain more together than what was found."""
+    prepared, selection, found = sought.prepared, sought.selection, sought.found
+    seen = evident(sought.suspects, selection, found)
     if seen is None:
         return None
     some = _fewer(prepared, len(seen.actuators))
-    best = _searched(some, selection, seen, search=search, generator=generator)
+    best = _searched(some, selection, seen, search=sought.search, generator=sought.generator)
     if best is None:
         return None
     lasting, chance = _needed(seen, *best)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 __all__ = ["beside_lost_samples"]
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,54 +22,36 @@ from scipy.interpolate import Akima1DInterpolator
 from ..effects.sensors import SensorDropout
 from ..logs.log import Log
 from ..logs.velocity import Windows, velocity
-from .chance import Chance
+from .beside_losses import CERTAIN, Beside, Sought
 from .loss_law import LossLaw
 from .loss_segments import STEPS, LossSegments
-from .loss_suspects import LIKELIER, Alone, Suspects
+from .loss_suspects import LIKELIER, Alone
 from .losses import found_beside
-from .lost_commands import CERTAIN, Beside
 from .objective import Point, Unit
 from .preparation import Prepared
 from .prepared_anew import with_other_logs
 from .segments import cut
-from .selection import Selection
 
 Array = NDArray[np.float64]
 _SPOILED = 0.01  # of segments, by something else
 _STRIDE = 4  # rows from one segment to the next: each sample is decided on twice
 
 
-def beside_lost_samples(
-    prepared: Prepared,
-    selection: Selection,
-    found: Sequence[Chance],
-    *,
-    suspects: Suspects,
-    search: Callable[[Prepared], tuple[Prepared, Selection]],
-    generator: np.random.Generator,
-) -> Beside | None:
-    """Return effects that last beside samples that were lost, where there are more than was found.
-
-    Args:
-        prepared: Logs as they were recorded.
-        selection: The effects that last, found with those.
-        found: What was found of losses, beside them or in their place.
-        suspects: Short segments in which samples may have been lost.
-        search: Searches for effects that last.
-        generator: Of simulated noise.
-    """
+def beside_lost_samples(sought: Sought) -> Beside | None:
+    """Return effects that last beside samples that were lost, if there are more than was found."""
+    prepared, selection, found = sought.prepared, sought.selection, sought.found
     if not found or not isinstance(found[0].unit.effect, SensorDropout):
         return None
     best, model = found[0], prepared.predictor.system.task.model
     if model.nq != model.nv:  # a rotation is not interpolated by its coordinates
         return None
-    renewal = _Renewal(prepared, best.unit, best.strength, suspects.alone.law.size)
+    renewal = _Renewal(prepared, best.unit, best.strength, sought.suspects.alone.law.size)
     known = selection.best if best.beside else selection.nominal
     logs = {name: renewal.of(part, known.fit.point) for name, part in prepared.logs.items()}
-    again, other = search(with_other_logs(prepared, logs, generator=generator))
+    again, other = sought.search(with_other_logs(prepared, logs, generator=sought.generator))
     if not set(other.best.names) - set(known.names):
         return None
-    data = {name: one.at(other.best.fit.point) for name, one in suspects.nominal.items()}
+    data = {name: one.at(other.best.fit.point) for name, one in sought.suspects.nominal.items()}
     chance = found_beside(data, best.unit, Alone.of(data), other.best.units)
     if chance is None or chance.deviance > best.deviance - CERTAIN:
         return None
