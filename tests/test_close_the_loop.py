@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -46,8 +47,12 @@ def finished(run, tmp_path_factory):
 
 
 def test_the_same_seed_gives_the_same_numbers(finished, run, same_numbers, tmp_path):
-    run(*SHORT, f"out={tmp_path / 'again'}")
-    same_numbers(tmp_path / "again", finished)
+    """Both are diagnosed again, and a policy of each source is trained again."""
+    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
+    for gone in ("with_0", "without_1"):
+        (tmp_path / "parts" / f"{gone}.json").unlink()
+    run(f"resume={tmp_path}", "progress=false")
+    same_numbers(tmp_path, finished)
 
 
 def test_the_effect_is_named_and_becomes_one_more_parameter(finished):

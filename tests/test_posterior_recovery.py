@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_line import run_recipe
+from command_line import run_here, run_recipe
 
 from torchrl_bayessim.inference.priors import BoxPrior
 
@@ -100,28 +100,24 @@ def test_table_and_picture_are_there(finished):
 
 
 def test_a_missing_part_is_run_again_to_the_same_numbers_and_no_other(
-    finished, same_numbers, tmp_path
+    finished, same_numbers, tmp_path, monkeypatch
 ):
     shutil.copytree(finished[0] / "run", tmp_path / "run")
     missing, *others = sorted((tmp_path / "run/parts").iterdir())
     before = [path.stat().st_mtime_ns for path in others]
     missing.unlink()
-    status, _, err = run(
-        "short=true", "processes=1", "problem=pendulum", "out=run", folder=tmp_path
-    )
-    assert status == 0, err
+    asked = "short=true", "processes=1", "problem=pendulum", f"out={tmp_path / 'run'}"
+    run_here(monkeypatch, RECIPE, "Recovery", *asked)
     assert others
     assert [path.stat().st_mtime_ns for path in others] == before
     same_numbers(tmp_path / "run", finished[0] / "run")
 
 
-def test_by_the_papers_protocol_ten_trajectories_together_tell_more_than_their_mean(tmp_path):
-    status, _, err = run(
-        *("short=true", "processes=1", "paper_mode=true", "problem=pendulum"),
-        *("online=false", "out=run"),
-        folder=tmp_path,
-    )
-    assert status == 0, err
+def test_by_the_papers_protocol_ten_trajectories_together_tell_more_than_their_mean(
+    tmp_path, monkeypatch
+):
+    asked = "short=true", "paper_mode=true", "problem=pendulum", "online=false"
+    run_here(monkeypatch, RECIPE, "Recovery", *asked, f"out={tmp_path / 'run'}")
     rows = json.loads((tmp_path / "run/result.json").read_text())["rows"]
     found = {row["method"]: row for row in rows}
     (pooled,) = (row for name, row in found.items() if name.startswith("BayesSim pooled"))

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from command_line import run_recipe
+from command_line import run_here, run_recipe
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "sequential_refinement.py"
 
@@ -16,7 +16,9 @@ RECIPE = Path(__file__).parent.parent / "recipes" / "sequential_refinement.py"
 run = partial(run_recipe, RECIPE)
 
 
-def test_both_ways_tell_more_with_more_simulations_and_parts_are_kept(tmp_path, same_numbers):
+def test_both_ways_tell_more_with_more_simulations_and_parts_are_kept(
+    tmp_path, same_numbers, monkeypatch
+):
     status, out, err = run("short=true", "processes=1", "out=run", folder=tmp_path)
     assert status == 0, err
     result = json.loads((tmp_path / "run/result.json").read_text())
@@ -36,8 +38,8 @@ def test_both_ways_tell_more_with_more_simulations_and_parts_are_kept(tmp_path, 
     assert len(parts) == 3
     shutil.copytree(tmp_path / "run", tmp_path / "again")
     (tmp_path / "again/parts" / parts[0].name).unlink()  # which is run again, to the same numbers
-    status, _, err = run("short=true", "processes=1", "out=again", folder=tmp_path)
-    assert status == 0, err
+    asked = "short=true", "processes=1", f"out={tmp_path / 'again'}"
+    run_here(monkeypatch, RECIPE, "Refinement", *asked)
     same_numbers(tmp_path / "run", tmp_path / "again")
 
 

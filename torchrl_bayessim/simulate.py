@@ -28,6 +28,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
+from torchrl.modules.tensordict_module.exploration import RandomPolicy
 
 from .counts import check_count
 from .diverged import UndisturbedPolicy, check_policy
@@ -54,6 +55,9 @@ def make_collector(env: EnvBase, policy: TensorDictModuleBase | None, *, steps: 
     """
     if isinstance(policy, TensorDictModuleBase):
         policy = UndisturbedPolicy(policy)
+    elif policy is None and len(env.action_keys) == 1:
+        # what the collector would take, which fills a tensordict of its own at every step
+        policy = RandomPolicy(env.action_spec, action_key=env.action_key)
     with isolated("collector"):  # it tries out the policy
         return Collector(
             env,
