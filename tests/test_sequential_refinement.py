@@ -1,26 +1,22 @@
-"""Rounds against one round from the command line, as users run it."""
+"""Rounds against one round, as the recipe runs them."""
 
 import json
 import re
 import shutil
 import sys
-from functools import partial
 from pathlib import Path
 
 import pytest
-from command_line import run_here, run_recipe
+from command_line import run_here
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "sequential_refinement.py"
 
 
-run = partial(run_recipe, RECIPE)
-
-
 def test_both_ways_tell_more_with_more_simulations_and_parts_are_kept(
-    tmp_path, same_numbers, monkeypatch
+    tmp_path, same_numbers, monkeypatch, capsys
 ):
-    status, out, err = run("short=true", "processes=1", "out=run", folder=tmp_path)
-    assert status == 0, err
+    run_here(monkeypatch, RECIPE, "Refinement", "short=true", f"out={tmp_path / 'run'}")
+    out = capsys.readouterr().out
     result = json.loads((tmp_path / "run/result.json").read_text())
     assert json.loads(out.splitlines()[-1].removeprefix("RESULT ")) == result
     found = result["problems"]["pendulum"]
@@ -38,8 +34,7 @@ def test_both_ways_tell_more_with_more_simulations_and_parts_are_kept(
     assert len(parts) == 3
     shutil.copytree(tmp_path / "run", tmp_path / "again")
     (tmp_path / "again/parts" / parts[0].name).unlink()  # which is run again, to the same numbers
-    asked = "short=true", "processes=1", f"out={tmp_path / 'again'}"
-    run_here(monkeypatch, RECIPE, "Refinement", *asked)
+    run_here(monkeypatch, RECIPE, "Refinement", "short=true", f"out={tmp_path / 'again'}")
     same_numbers(tmp_path / "run", tmp_path / "again")
 
 

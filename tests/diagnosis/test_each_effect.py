@@ -15,9 +15,8 @@ def benchmark(monkeypatch):
     monkeypatch.syspath_prepend(BENCHMARKS)
     import each_effect
 
-    # two that are found, one of them a law without slope, one that robots without contacts cannot
-    # have, one that is never excited
-    names = ("quadratic_drag", "backlash", "contact_friction", "saturation")
+    # one that is found, one that robots without contacts cannot have, one that is never excited
+    names = ("quadratic_drag", "contact_friction", "saturation")
     few = {name: CATALOGUE[name] for name in names}
     monkeypatch.setattr(each_effect, "CATALOGUE", few)
     return each_effect
@@ -27,16 +26,13 @@ def test_what_was_put_on_is_found_or_said_not_to_show(benchmark, capsys):
     benchmark.main("hopper=0", "cartpole=0", "percent=20")
     *lines, total = map(json.loads, capsys.readouterr().out.splitlines())
     found = {line["case"].partition(" at ")[0]: line for line in lines}
-    assert found.keys() == {
-        f"two_links, {name}" for name in ("quadratic_drag", "backlash", "saturation")
-    }
-    assert found["two_links, backlash"]["value"] == "named"
+    assert found.keys() == {f"two_links, {name}" for name in ("quadratic_drag", "saturation")}
     drag = found["two_links, quadratic_drag"]
     assert drag["value"] == "named"
     (strength,) = drag["effects"].values()
     assert strength == pytest.approx(drag["strength"], rel=0.02)
     assert found["two_links, saturation"]["value"] == "not shown"
-    assert total["value"] == {"named": 2, "not shown": 1}
+    assert total["value"] == {"named": 1, "not shown": 1}
 
 
 def test_an_effect_that_is_overlooked_is_missed(benchmark, monkeypatch, capsys):
