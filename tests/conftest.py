@@ -3,6 +3,7 @@
 import gc
 import os
 from pathlib import Path
+from weakref import WeakSet
 
 import numpy as np
 import pytest
@@ -24,8 +25,22 @@ def fixed_seed():
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def batched_environments():
+    """Note the environments of several that are made: to look through all objects takes long."""
+    made, begin = WeakSet(), BatchedEnvBase.__init__
+
+    def noted(self, *given, **options):
+        made.add(self)
+        begin(self, *given, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(BatchedEnvBase, "__init__", noted)
+        yield made
+
+
 @pytest.fixture(scope="module", autouse=True)
-def no_workers_are_left():
+def no_workers_are_left(batched_environments):
     """Collect what a file of tests leaves, and close what is still held.
 
     An environment that is collected in the midst of a test of another file closes itself then, and
@@ -33,9 +48,9 @@ def no_workers_are_left():
     last bits from those of the same seed.
     """
     yield
-    gc.collect()
-    batched = [e for e in gc.get_objects() if issubclass(type(e), BatchedEnvBase)]
-    for env in batched:
+    if batched_environments:
+        gc.collect()
+    for env in list(batched_environments):
         if not env.is_closed:
             env.close()
     torch.set_num_threads(1)

@@ -53,15 +53,16 @@ def make_collector(env: EnvBase, policy: TensorDictModuleBase | None, *, steps: 
 
     The policy goes on where a simulation diverges: see :mod:`.diverged`.
     """
+    acting: Callable[[TensorDictBase], TensorDictBase] | None = policy
     if isinstance(policy, TensorDictModuleBase):
-        policy = UndisturbedPolicy(policy)
+        acting = UndisturbedPolicy(policy)
     elif policy is None and len(env.action_keys) == 1:
         # what the collector would take, which fills a tensordict of its own at every step
-        policy = RandomPolicy(env.action_spec, action_key=env.action_key)
+        acting = RandomPolicy(env.action_spec, action_key=env.action_key)
     with isolated("collector"):  # it tries out the policy
         return Collector(
             env,
-            policy,
+            acting,
             frames_per_batch=max(1, env.batch_size.numel()) * steps,
             total_frames=-1,
             auto_register_policy_transforms=False,

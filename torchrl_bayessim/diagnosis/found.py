@@ -4,6 +4,7 @@ from __future__ import annotations
 
 __all__ = ["Found"]
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -204,6 +205,14 @@ def _at_targets(strengths: Mapping[Unit, float], robot: Robot) -> dict[str, floa
     return found
 
 
+def _together(
+    units: Sequence[Unit], strengths: Sequence[float], errors: Sequence[float]
+) -> tuple[float, float]:
+    """Return the strength and its error: the mean of places, at each the sum of the laws there."""
+    places = len({unit.where for unit in units})
+    return sum(strengths) / places, math.hypot(*errors) / places
+
+
 def _effects(
     selection: Selection,
     credit: Mapping[str, float],
@@ -221,8 +230,7 @@ def _effects(
     for name, confused in equals.items():
         units = [u for u in best.units if u.name == name]
         strengths = [u.actual(best.fit.point.strengths[u]) for u in units]
-        mean = float(np.mean(strengths))
-        error = float(np.sqrt(np.sum([errors[u] ** 2 for u in units])) / len(units))
+        mean, error = _together(units, strengths, [errors[u] for u in units])
         found.append(
             Finding(
                 name=name,
