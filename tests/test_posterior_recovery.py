@@ -153,7 +153,8 @@ def test_parts_of_other_methods_are_other_parts(tmp_path, monkeypatch):
         assert posterior_recovery.run(settings, "pendulum", 0, tmp_path) == {"online": online}
 
 
-def test_an_unknown_problem_ends_in_one_line(tmp_path):
-    status, _, err = run("problem=pendulumm", folder=tmp_path)
-    assert status == 2
-    assert "expected a problem, got 'pendulumm'. Available: pendulum (did you mean" in err
+def test_an_unknown_problem_ends_in_one_line(tmp_path, monkeypatch, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        run_here(monkeypatch, RECIPE, "Recovery", "problem=pendulumm", f"out={tmp_path / 'run'}")
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "expected a problem, got 'pendulumm'. Available: pendulum (did you mean" in line

@@ -122,11 +122,3 @@ def test_a_prior_that_does_not_fit_is_refused():
         SbiSource(Constant([1.0]), names=["length"], prior=PRIOR)
     with pytest.raises(TypeError, match="a prior with names and contains, got 'Uniform'"):
         SbiSource(Constant([1.0]), names=["a"], prior=torch.distributions.Uniform(0, 1))
-
-
-def test_sbi_is_not_imported_by_the_module():
-    import subprocess
-    import sys
-
-    code = "import sys, torchrl_bayessim.sbi_source; assert 'sbi' not in sys.modules"
-    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
