@@ -10,6 +10,7 @@ from pathlib import Path
 from threading import Barrier
 
 import pytest
+from command_line import run_here
 
 RECIPE = Path(__file__).parent.parent / "recipes" / "sim2real_ppo.py"
 TINY = ["short=true", "progress=false", "rounds=2", "episodes=2", "simulations=48"]
@@ -119,16 +120,12 @@ def test_killed_in_mid_run_it_resumes_to_the_same_files(finished, tmp_path, monk
 
 
 def test_another_recipe_leaves_a_run_alone(finished, tmp_path, monkeypatch, capsys):
-    monkeypatch.syspath_prepend(RECIPE.parent)
-    import posterior_recovery
-    import recipe
-
     folder = tmp_path / "run"
     shutil.copytree(finished[0], folder)
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    monkeypatch.setattr(sys, "argv", ["posterior_recovery.py", "short=true", f"out={folder}"])
+    another = RECIPE.with_name("posterior_recovery.py")
     with pytest.raises(SystemExit, match="2"):
-        recipe.main(posterior_recovery.Recovery, posterior_recovery.job)
+        run_here(monkeypatch, another, "Recovery", "short=true", f"out={folder}")
     assert "a folder without a run" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 

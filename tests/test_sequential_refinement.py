@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -41,15 +40,11 @@ def test_both_ways_tell_more_with_more_simulations_and_parts_are_kept(
 @pytest.fixture
 def refusal(monkeypatch, tmp_path, capsys):
     """Return what turns an argument into what is said of it."""
-    monkeypatch.syspath_prepend(RECIPE.parent)
     monkeypatch.chdir(tmp_path)
-    import recipe
-    from sequential_refinement import Refinement, job
 
     def refusal(given):
-        monkeypatch.setattr(sys, "argv", [RECIPE.name, given])
         with pytest.raises(SystemExit, match="2"):
-            recipe.main(Refinement, job)
+            run_here(monkeypatch, RECIPE, "Refinement", given)
         return capsys.readouterr().err
 
     return refusal
