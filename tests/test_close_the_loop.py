@@ -46,6 +46,7 @@ def finished(run, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_numbers(finished, run, same_numbers, tmp_path):
     """Both are diagnosed again, and a policy of each source is trained again."""
     shutil.copytree(finished, tmp_path, dirs_exist_ok=True)

@@ -42,6 +42,7 @@ def finished(run, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_numbers(finished, run, same_numbers, tmp_path):
     run(*TINY, *LEARNER, f"out={tmp_path / 'again'}")
     same_numbers(tmp_path / "again", finished)

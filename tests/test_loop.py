@@ -364,6 +364,7 @@ def test_a_quiet_loop_has_quiet_fits_unless_they_are_asked_to_talk(capsys):
     assert shown == [False, True]
 
 
+@pytest.mark.slow
 def test_more_than_ten_rounds():
     loop = make_loop(rounds=12, updates=1, horizon=4, simulations=12)
     turns = list(loop)
@@ -374,6 +375,7 @@ def test_more_than_ten_rounds():
     assert len({turn.posterior.mean.item() for turn in turns}) == 12
 
 
+@pytest.mark.slow
 def test_more_than_ten_rounds_go_on_where_they_were_left(tmp_path):
     options = {"rounds": 13, "updates": 1, "horizon": 4, "simulations": 12}
     whole = [numbers(turn) for turn in make_loop(**options)]

@@ -113,6 +113,7 @@ def test_a_missing_part_is_run_again_to_the_same_numbers_and_no_other(
     same_numbers(tmp_path / "run", finished[0] / "run")
 
 
+@pytest.mark.slow
 def test_by_the_papers_protocol_ten_trajectories_together_tell_more_than_their_mean(
     tmp_path, monkeypatch
 ):

@@ -105,6 +105,7 @@ def test_the_policy_is_filmed(finished, moves):
     moves(folder / "posterior.gif", pictures=5)
 
 
+@pytest.mark.slow
 def test_killed_in_mid_run_it_resumes_to_the_same_files(finished, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(RECIPE.parent / "benchmarks")
     from killed import Case, run

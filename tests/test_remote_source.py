@@ -93,7 +93,10 @@ def assert_push_arrives(kind, **more):
     assert torch.isin(after, table).all()
 
 
-@pytest.mark.parametrize("kind", [Collector, MultiSyncCollector, MultiAsyncCollector])
+@pytest.mark.parametrize(
+    "kind",
+    [Collector, MultiSyncCollector, pytest.param(MultiAsyncCollector, marks=pytest.mark.slow)],
+)
 def test_a_pushed_source_reaches_every_worker_and_workers_draw_differently(kind):
     assert_push_arrives(kind)
 
@@ -114,6 +117,7 @@ def test_a_pushed_source_reaches_workers_of_ray():
     gc.collect()  # handles of its processes, which warn when they go
 
 
+@pytest.mark.slow
 def test_which_worker_runs_an_environment_does_not_matter():
     """Four environments in one process, or two in each of two: the same θ in the same episodes."""
 

@@ -72,6 +72,7 @@ def test_finished_policies_are_not_trained_again(finished, run, capsys):
     assert after["runs"] == before["runs"]
 
 
+@pytest.mark.slow
 def test_policies_trained_after_a_break_are_the_same(finished, run, same_numbers, tmp_path):
     """As they are whenever the seed is the same: each source's once more, of one seed or other."""
     shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
@@ -172,6 +173,7 @@ def test_the_last_policy_can_be_asked_for(run, tmp_path):
     assert "policies are each the last" in (tmp_path / "table.md").read_text()
 
 
+@pytest.mark.slow
 def test_cartpoles_posterior_is_refined_once(cartpole, run, tmp_path):
     result, folder = cartpole
     assert result["inference_frames"] == 2 * 16 * 2 * 128
@@ -238,6 +240,7 @@ def test_intervals_are_students(run):
 ROBOT = torch.tensor([1.5, 1.2])  # a half-length and a mass that are not nominal
 
 
+@pytest.mark.slow
 def test_seeds_that_ran_by_themselves_become_one_figure(finished, run, same_numbers, tmp_path):
     asked = [*TINY[:2], *TINY[3:], "task=fetch_reach", "sources=oracle"]
     for seed in ("seed0", "seed1"):  # which ran one after the other
@@ -251,6 +254,7 @@ def test_seeds_that_ran_by_themselves_become_one_figure(finished, run, same_numb
     same_numbers(tmp_path / "apart", tmp_path / "together")
 
 
+@pytest.mark.slow
 def test_the_robot_may_be_another(run, tmp_path):
     asked = ["task=fetch_reach", "sources=oracle", "truth=120", f"out={tmp_path}"]
     run(*TINY, *asked)
@@ -286,6 +290,7 @@ def a_study(folder, **settings):
     return Study(task, ROBOT, given, folder, seed=0)
 
 
+@pytest.mark.slow
 def test_a_policy_is_trained_under_the_source_that_its_name_says(run, tmp_path):
     del run
     study = a_study(tmp_path, simulations=128, domains=0)
@@ -313,6 +318,7 @@ def test_a_policy_is_trained_under_the_source_that_its_name_says(run, tmp_path):
     assert trained_under["posterior"].std(0)[0] < 0.7 * trained_under["prior"].std(0)[0]
 
 
+@pytest.mark.slow
 def test_domains_are_drawn_once_and_told(run, tmp_path):
     run(*CARTPOLE, "domains=2", "sources=prior", "progress=false", "video=false", f"out={tmp_path}")
     assert "each policy saw 2 domains" in (tmp_path / "table.md").read_text()

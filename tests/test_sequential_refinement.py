@@ -11,6 +11,7 @@ from command_line import run_here
 RECIPE = Path(__file__).parent.parent / "recipes" / "sequential_refinement.py"
 
 
+@pytest.mark.slow
 def test_both_ways_tell_more_with_more_simulations_and_parts_are_kept(
     tmp_path, same_numbers, monkeypatch, capsys
 ):

@@ -426,7 +426,7 @@ def test_other_names_than_the_writer_are_an_error():
         randomizer.source = Empirical([[1.0, 1.0]], names=swapped)
 
 
-@pytest.mark.parametrize("batched", [SerialEnv, ParallelEnv])
+@pytest.mark.parametrize("batched", [SerialEnv, pytest.param(ParallelEnv, marks=pytest.mark.slow)])
 def test_batches_of_batches_are_randomized(batched):
     env = batched(2, partial(SerialEnv, 3, physical))
     env = TransformedEnv(env, DomainRandomizer(Uniform(), seed=0))

@@ -392,7 +392,10 @@ def test_detectability_is_nothing_without_a_cause_and_grows_with_it():
     assert some.detectability > 100
 
 
-@pytest.mark.parametrize(("robot", "least", "most"), [("arm", 0.95, 1.01), ("hopper", 0.0, 0.9)])
+@pytest.mark.parametrize(
+    ("robot", "least", "most"),
+    [("arm", 0.95, 1.01), pytest.param("hopper", 0.0, 0.9, marks=pytest.mark.slow)],
+)
 def test_where_contacts_amplify_noise_a_cause_is_less_visible_than_derivatives_say(
     robot, least, most, monkeypatch
 ):
@@ -406,6 +409,7 @@ def test_where_contacts_amplify_noise_a_cause_is_less_visible_than_derivatives_s
     assert least < seen / make(plan, np.random.default_rng(5)).detectability < most
 
 
+@pytest.mark.slow
 def test_a_pair_is_as_visible_as_the_less_visible_of_its_causes(monkeypatch):
     from withheld import cases
 

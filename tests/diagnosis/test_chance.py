@@ -42,7 +42,7 @@ def status(report, name):
     return {c.status for c in report.candidates if c.name == name}
 
 
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_lost_packets_are_told_from_a_lag_by_their_scatter(seed):
     act = lost(0.2, np.random.default_rng(seed))
     report = diagnose(system(), None, logs(8, act=act), effects=SOME)
@@ -108,6 +108,7 @@ def test_an_estimated_velocity_is_estimated_from_bridged_positions():
     assert float((bridge.qvel - log.qvel).abs().median()) < 0.3
 
 
+@pytest.mark.slow
 def test_noise_hides_whether_what_is_late_varies():
     rng = np.random.default_rng(5)
 
@@ -120,6 +121,7 @@ def test_noise_hides_whether_what_is_late_varies():
     assert "confounded" in status(report, "action_jitter")
 
 
+@pytest.mark.slow
 def test_a_delay_of_several_steps_does_not_vary():
     report = diagnose(system(), None, logs(act=lambda u, k: u[max(k - 3, 0)]), effects=SOME)
     assert report.effects[0].name == "action_delay"

@@ -60,8 +60,8 @@ def described():
     ("name", "shaft", "within"),
     [
         ("series_elasticity", spring(10.0, 0.2), 0.1),
-        ("series_elasticity", spring(22.0, 0.2), 0.25),
-        ("backlash", gap(0.05), 0.15),
+        pytest.param("series_elasticity", spring(22.0, 0.2), 0.25, marks=pytest.mark.slow),
+        pytest.param("backlash", gap(0.05), 0.15, marks=pytest.mark.slow),
     ],
 )
 def test_what_is_between_rotor_and_link_is_named_with_its_size(name, shaft, within):

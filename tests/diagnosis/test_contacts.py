@@ -102,6 +102,7 @@ def test_a_filter_is_believed_only_where_it_makes_predictions_likelier():
     assert not likelier(predictor, logs, wrong, **known)
 
 
+@pytest.mark.slow
 def test_a_mass_and_an_armature_are_not_taken_for_friction_of_the_contact():
     logs = [recorded(70 + k, friction=0.28, rows=250)[0] for k in range(5)]
     effects = "contact_friction", "armature"
@@ -131,7 +132,7 @@ def test_a_block_at_rest_on_a_plane_lacks_nothing():
     assert report.verdict == "none"
 
 
-@pytest.mark.parametrize("first", [0, 10])
+@pytest.mark.parametrize("first", [0, pytest.param(10, marks=pytest.mark.slow)])
 def test_friction_of_a_contact_is_not_excluded(first):
     logs = [recorded(first + k, friction=0.55)[0] for k in range(5)]
     report = diagnose(system(), None, logs, effects=EFFECTS)

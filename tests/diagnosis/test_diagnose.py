@@ -222,6 +222,7 @@ def test_the_frequency_of_a_disturbance_is_found():
     assert {k: v for k, v in told["candidates"][-1].items() if k == "form"} == {"form": {}}
 
 
+@pytest.mark.slow
 def test_what_a_larger_cause_hides_is_given_its_frequency_beside_it():
     data = logs(5, push=lambda q, v: 0.06 * np.sin(9 * q + 1.0) - 1.5 * q)
     effects = "parallel_spring", "cogging", "coulomb_friction", "constant_force"

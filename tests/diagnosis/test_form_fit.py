@@ -72,6 +72,7 @@ def test_magnets_behind_a_gear_are_found_with_their_number_per_turn_of_the_hinge
     assert found.phase == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_spring_and_a_shaking_force_are_found_though_no_law_as_offered_predicts_other_runs():
     """Seed 2: a spring as it was offered fits some runs only; one that hardens fits others too."""
     stiffness, hardening, strength = 1.588, 7.62, 0.263
@@ -90,6 +91,7 @@ def test_a_spring_and_a_shaking_force_are_found_though_no_law_as_offered_predict
         assert effect.ci95[0] < true < effect.ci95[1]
 
 
+@pytest.mark.slow
 def test_a_form_is_fitted_again_once_a_second_cause_is_in_the_model():
     """Seed 0: alone the spring seems to harden by 7."""
     report = diagnosed(
@@ -165,6 +167,7 @@ def unit_of(effect):
     return Unit(effect, "motor", (1.0,), 0.0, 1.0)
 
 
+@pytest.mark.slow
 def test_a_law_that_was_bent_to_make_up_for_a_second_cause_is_straight_beside_it():
     """Alone, drag grows with the power 2.4 of speed, and no limit helps beside that drag."""
     sent = {}

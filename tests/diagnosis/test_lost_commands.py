@@ -70,7 +70,13 @@ def test_commands_that_arrived_are_told_from_those_that_were_sent():
     ("name", "strength", "through", "push"),
     [
         ("dead_band", 0.5, lambda u: np.sign(u) * max(abs(u) - 0.5, 0.0), lambda q, v: 0.0),
-        ("coulomb_friction", 0.3, lambda u: u, lambda q, v: -0.3 * np.tanh(v / 0.01)),
+        pytest.param(
+            "coulomb_friction",
+            0.3,
+            lambda u: u,
+            lambda q, v: -0.3 * np.tanh(v / 0.01),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_another_cause_is_found_beside_lost_commands(name, strength, through, push):
@@ -111,6 +117,7 @@ def test_what_packets_of_several_commands_hide_leaves_them_their_share_of_the_ga
     assert "of 900 commands" in note
 
 
+@pytest.mark.slow
 def test_of_many_runs_some_are_decided_on(monkeypatch):
     monkeypatch.setattr("torchrl_bayessim.diagnosis.lost_commands._LARGEST", 20_000)
     act, _ = jumps(0.15, 2, through=lambda u: np.sign(u) * max(abs(u) - 0.5, 0.0))

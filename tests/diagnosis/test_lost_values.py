@@ -69,6 +69,7 @@ def test_a_lag_explains_lost_commands_only_if_it_does_over_long_segments(
     assert _explained(SimpleNamespace(calm=calm), best) is explained
 
 
+@pytest.mark.slow
 def test_lost_commands_are_found_beside_a_drive_that_saturates():
     arrives = rough(0.1, np.random.default_rng(1))
     act = lambda u, k: float(np.clip(arrives(u, k), -2.0, 2.0))
@@ -138,6 +139,7 @@ def test_samples_and_commands_are_told_apart():
     assert diagnose(system(), None, data, effects=SOME).confusion_set == ("sensor_dropout",)
 
 
+@pytest.mark.slow
 def test_friction_and_samples_that_are_not_renewed_are_both_named():
     rng = np.random.default_rng(6)
     data = logs(8, push=lambda _, v: -0.15 * np.tanh(v / 0.02))
@@ -231,6 +233,7 @@ def test_losses_are_not_tried_where_an_effect_that_lasts_leaves_noise_alone(monk
     assert [effect.name for effect in report.effects] == ["coulomb_friction"]
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_where_commands_are_late_in_a_way_that_no_effect_has():
     def smeared(u, k):
         return float(np.mean(u[max(k - 5, 0) : k + 1]))

@@ -104,7 +104,7 @@ def test_a_small_bias_of_every_trajectory_is_found_in_their_mean(network):
     assert trust(network, off, simulate=simulate).predictive < 0.01
 
 
-@pytest.mark.parametrize("count", [2, 20])
+@pytest.mark.parametrize("count", [2, pytest.param(20, marks=pytest.mark.slow)])
 def test_right_trajectories_are_a_surprise_as_rarely_as_was_promised(network, count):
     alarms = 0
     few = network.held_out[:1]  # of calibration nothing is asked here

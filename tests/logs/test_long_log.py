@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from one_joint_arm import describe
 
 READ = """
@@ -34,6 +35,7 @@ print(json.dumps(told))
 """
 
 
+@pytest.mark.slow
 def test_ten_million_rows(tmp_path):
     describe(tmp_path)
     command = [sys.executable, "-W", "ignore", "-c", READ]
