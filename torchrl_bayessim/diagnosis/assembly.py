@@ -29,6 +29,7 @@ from .location import location
 from .model import Model
 from .objective import Objective, Point, Unit
 from .odd_runs import odd_run_alarms, odd_runs, run_errors, unexplained_run_alarms
+from .one_cause import dry_friction, dry_friction_alarms, told_together
 from .preparation import Prepared
 from .report import Candidate, Gap, Parameter, Report
 from .rollout import rollout_errors, worse_rollouts
@@ -36,7 +37,7 @@ from .scatter import Scatter
 from .selection import Selection
 from .shrinkage import Shrinkage
 from .verdict import conclude
-from .wavering import slow_wave_alarms, slow_waves, told_together, wavering_alarms
+from .wavering import slow_wave_alarms, slow_waves, wavering_alarms
 from .whole_runs import whole_run_alarm
 
 Array = NDArray[np.float64]
@@ -74,8 +75,7 @@ def assemble(
     offered = selection.screens[0].units
     best = with_slopes_of_forms(prepared.sets["train"], selection.best, offered)
     selection = replace(selection, best=best)
-    waves = slow_waves(best, prepared.sets["train"].segments, system.robot)
-    credit = told_together(credit_of(selection), waves)
+    credit, together = _causes(prepared, selection)
     points = _points(selection)
     found = Found.of(prepared, selection, scatter, credit, points=points, generator=generator)
     seen = (
@@ -126,10 +126,10 @@ def assemble(
         if rules:
             where |= {"regimes": [asdict(rule) for rule in rules], "regimes_of": first}
         more += wavering_alarms(best, prepared.sets["train"].segments)
-        more += slow_wave_alarms(waves)
+        more += [*slow_wave_alarms(together), *dry_friction_alarms(best, together, system.robot)]
     names, measured = {effect.name for effect in found.effects}, found.measured
     left = measured.effects if names else measured.refit
-    seen = concluded(seen, verdict, names, left=left)
+    seen = concluded(seen, verdict, names | together.keys() if names else names, left=left)
     told = dict(zip(_TOLD[: 2 + bool(best.units)], points.values(), strict=False))
     alarms = [
         *prepared.alarms,
@@ -158,6 +158,15 @@ def assemble(
         strengths=found.strengths,
         figures=figures(prepared, selection, found.measured),
     )
+
+
+def _causes(prepared: Prepared, selection: Selection) -> tuple[dict[str, float], dict[str, str]]:
+    """Return the credit of each cause, and the effects that are told with another's name."""
+    best, robot = selection.best, prepared.predictor.system.robot
+    credit = credit_of(selection)
+    together = slow_waves(best, prepared.sets["train"].segments, robot)
+    together |= dry_friction(best, credit, robot)
+    return told_together(credit, together), together
 
 
 def _every_unit(selection: Selection, scatter: Scatter) -> list[Unit]:

@@ -21,7 +21,7 @@ simulator, and is told with the push.
 
 from __future__ import annotations
 
-__all__ = ["slow_wave_alarms", "slow_waves", "told_together", "waver", "wavering_alarms"]
+__all__ = ["slow_wave_alarms", "slow_waves", "waver", "wavering_alarms"]
 
 from collections.abc import Mapping, Sequence
 
@@ -126,27 +126,14 @@ def _size(model: Model, unit: Unit) -> float:
     return float(np.linalg.norm(model.fit.change(unit)))
 
 
-def slow_wave_alarms(waves: Mapping[str, str]) -> list[str]:
-    """Return an alarm for each wave that is told with its push."""
+def slow_wave_alarms(together: Mapping[str, str]) -> list[str]:
+    """Return an alarm for each wave among what is told together, by its name with its push's."""
     return [
         f"{plain(push)} wavers, slower than runs can show to repeat: in the simulator a "
         f"{plain(wave)} stands for that"
-        for wave, push in waves.items()
+        for wave, push in together.items()
+        if wave == PeriodicDisturbance.name
     ]
-
-
-def told_together(credit: Mapping[str, float], waves: Mapping[str, str]) -> dict[str, float]:
-    """Return the credit of effects, that of each wave with its push's.
-
-    Example:
-        >>> told_together({"constant_force": 0.75, "periodic_disturbance": 0.25},
-        ...               {"periodic_disturbance": "constant_force"})
-        {'constant_force': 1.0}
-    """
-    kept = {name: share for name, share in credit.items() if name not in waves}
-    for wave, push in waves.items():
-        kept[push] += credit[wave]
-    return kept
 
 
 def _left(fit: Fit, loose: Array, scale: float) -> tuple[float, Array]:

@@ -1,0 +1,69 @@
+"""Two laws of dry friction at one joint are one friction, told once and simulated twice."""
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+from test_diagnose import logs, system
+from test_doubts import TWO
+
+from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.objective import Point, units_of
+from torchrl_bayessim.diagnosis.one_cause import dry_friction, dry_friction_alarms
+from torchrl_bayessim.effects.catalogue import effect
+from torchrl_bayessim.envs.task import Task
+from torchrl_bayessim.logs.system import System
+
+ROBOT = System(task=Task(model=mujoco.MjModel.from_xml_string(TWO), frame_skip=5)).robot
+LAWS = "coulomb_friction", "stribeck_friction"
+FIRST, SECOND = ROBOT.joints[:2]
+
+
+def found(places, names=LAWS):
+    """Return a model of two laws, each at a joint or at all."""
+    units = [
+        next(u for u in units_of([effect(name)], ROBOT) if u.where == place)
+        for name, place in zip(names, places, strict=True)
+    ]
+    point = Point(np.zeros(1), dict(zip(units, (0.2, 0.1), strict=True)))
+    names = dict.fromkeys(unit.name for unit in units).keys()
+    return SimpleNamespace(units=tuple(units), names=names, fit=SimpleNamespace(point=point))
+
+
+@pytest.mark.parametrize(
+    ("places", "credit", "told"),
+    [
+        ((FIRST, FIRST), (0.7, 0.3), {LAWS[1]: LAWS[0]}),
+        ((FIRST, FIRST), (0.3, 0.7), {LAWS[0]: LAWS[1]}),
+        ((FIRST, FIRST), (0.5, 0.5), {LAWS[1]: LAWS[0]}),
+        (("all", SECOND), (0.7, 0.3), {LAWS[1]: LAWS[0]}),
+        (("all", SECOND), (0.3, 0.7), {}),  # friction at a joint where the named law has none
+        ((FIRST, SECOND), (0.7, 0.3), {}),
+    ],
+)
+def test_laws_of_dry_friction_are_one_where_they_share_their_joints(places, credit, told):
+    assert dry_friction(found(places), dict(zip(LAWS, credit, strict=True)), ROBOT) == told
+
+
+def test_other_friction_is_a_cause_of_its_own():
+    names = "coulomb_friction", "viscous_friction"
+    credit = dict.fromkeys(names, 0.5)
+    assert dry_friction(found((FIRST, FIRST), names), credit, ROBOT) == {}
+
+
+def test_an_alarm_tells_both_ends_of_the_curve():
+    (alarm,) = dry_friction_alarms(found((FIRST, FIRST)), {LAWS[1]: LAWS[0]}, ROBOT)
+    assert f"friction at {FIRST} fades with speed, from 0.3 to 0.2 N m" in alarm
+    assert dry_friction_alarms(found((FIRST, FIRST)), {}, ROBOT) == []
+
+
+def test_friction_that_fades_to_some_is_named_once_and_simulated_with_both_laws():
+    push = lambda q, v: -(0.15 + 0.4 * np.exp(-((v / 0.8) ** 2))) * np.tanh(v / 0.01)
+    effects = (*LAWS, "viscous_friction", "quadratic_drag", "dead_band")
+    report = diagnose(system(), None, logs(push=push), effects=effects)
+    assert [cause.name for cause in report.effects] in ([LAWS[0]], [LAWS[1]])
+    assert {law.name for law in report.strengths} == set(LAWS)
+    assert any("stand for it together" in alarm for alarm in report.alarms)
+    assert sum(sum(at.values()) for at in report.strengths.values()) == pytest.approx(0.55, rel=0.1)
+    assert {c.name for c in report.candidates if c.status == "named"} == set(LAWS)

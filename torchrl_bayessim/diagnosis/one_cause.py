@@ -1,0 +1,95 @@
+"""Effects of a model that are one cause together, and are told as one.
+
+The simulator keeps all of them: only the names are fewer.
+"""
+
+from __future__ import annotations
+
+__all__ = ["dry_friction", "dry_friction_alarms", "told_together"]
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..effects.friction import StribeckFriction
+from ..effects.joints import CoulombFriction
+from ..effects.robot import Robot
+from .cells import plain
+from .model import Model
+from .objective import Unit
+
+_LAWS = CoulombFriction.name, StribeckFriction.name
+
+
+def told_together(credit: Mapping[str, float], told: Mapping[str, str]) -> dict[str, float]:
+    """Return the credit of effects, that of some with the effect that each is told with.
+
+    Example:
+        >>> told_together({"constant_force": 0.75, "periodic_disturbance": 0.25},
+        ...               {"periodic_disturbance": "constant_force"})
+        {'constant_force': 1.0}
+    """
+    kept = {name: share for name, share in credit.items() if name not in told}
+    for name, other in told.items():
+        kept[other] += credit[name]
+    return kept
+
+
+def dry_friction(model: Model, credit: Mapping[str, float], robot: Robot) -> dict[str, str]:
+    """Return the law of dry friction that is told with another one, and that other's name.
+
+    The Stribeck curve, ``F_c + (F_s − F_c) e^{−(v/v_s)²}`` (Armstrong-Hélouvry, Dupont & Canudas de
+    Wit 1994), is Coulomb friction and what fades with speed: one friction, where both are at the
+    same joints. The law of more credit gives the name, of equal ones Coulomb's.
+
+    Args:
+        model: With the effects that were found.
+        credit: Each effect's share of what all explain.
+        robot: Where they act.
+    """
+    if not set(_LAWS) <= set(model.names):
+        return {}
+    first, second = sorted(_LAWS, key=lambda name: -credit[name])
+    there = _joints(model, first, robot)
+    return {second: first} if _joints(model, second, robot) <= there else {}
+
+
+def dry_friction_alarms(model: Model, told: Mapping[str, str], robot: Robot) -> list[str]:
+    """Return an alarm for friction that is told as one law and is two in the simulator.
+
+    Args:
+        model: With the effects that were found.
+        told: What is told with another; by :func:`dry_friction`, and other effects.
+        robot: Where they act.
+    """
+    strengths = model.fit.point.strengths
+    total: dict[str, dict[int, float]] = {name: {} for name in _LAWS}
+    for unit in model.units:
+        for target, part in enumerate(unit.direction):
+            if unit.name in total and part:
+                joint = unit.effect.joint(robot, target)
+                known = total[unit.name].get(joint, 0.0)
+                total[unit.name][joint] = known + part * unit.actual(strengths[unit])
+    always, fading = (total[name] for name in _LAWS)
+    return [
+        f"friction at {robot.joints[joint]} fades with speed, from "
+        f"{always[joint] + fading[joint]:.3g} to {always[joint]:.3g} {_measure(model, robot)}: in "
+        f"the simulator {plain(first)} and {plain(second)} stand for it together"
+        for second, first in told.items()
+        if second in _LAWS
+        for joint in sorted(always.keys() & fading.keys())
+    ]
+
+
+def _measure(model: Model, robot: Robot) -> str:
+    unit = next(unit for unit in model.units if unit.name in _LAWS)
+    return unit.measured_in(robot)
+
+
+def _joints(model: Model, name: str, robot: Robot) -> set[int]:
+    units: list[Unit] = [unit for unit in model.units if unit.name == name]
+    return {
+        unit.effect.joint(robot, int(target))
+        for unit in units
+        for target in np.flatnonzero(unit.direction)
+    }
