@@ -146,7 +146,7 @@ def test_the_search_is_not_done_again_where_no_losses_are_evident(monkeypatch):
         seen.append(sought.selection.best.mean_square)
         assert beside_lost_commands(replace(sought, search=search)) is None
 
-    monkeypatch.setattr("torchrl_bayessim.diagnosis.diagnose.beside_lost_commands", watched)
+    monkeypatch.setattr("torchrl_bayessim.diagnosis.with_chance.beside_lost_commands", watched)
     data = logs(6, push=lambda q, v: -0.4 * np.tanh(v / 0.3) * (1 + np.sin(9 * q)))
     diagnose(system(), None, data, effects=SOME)
     assert seen[0] > 3.0

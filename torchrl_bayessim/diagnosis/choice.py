@@ -7,7 +7,7 @@ __all__ = ["chosen", "fewest"]
 from collections.abc import Callable, Sequence
 
 from .form_fit import bendable, fitted_numbers, priced, with_fitted_forms
-from .model import WHITE, Model, as_good, best_by_effect, criterion, gain, judged, needed
+from .model import WHITE, Model, as_good, best_by_effect, criterion, gain, judged, needed, shown
 from .objective import Objective, Point, Unit
 from .refit import refit
 
@@ -18,7 +18,7 @@ _EQUAL = 0.1  # of the deviance
 def chosen(base: Model, models: Sequence[Model]) -> Model | None:
     """Return the best model, if the segments that it was not fitted on say that it is better."""
     dispersion = min([base.dispersion(), *(m.dispersion() for m in models)])
-    better = [m for m in models if gain(base, m) > needed(base, m)]
+    better = [m for m in models if shown(base, m)]
     if not better:
         return None
     least = min(criterion(m, dispersion) for m in better)

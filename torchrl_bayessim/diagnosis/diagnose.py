@@ -27,23 +27,17 @@ from ..logs.sanity import Finding as SanityFinding
 from ..logs.system import System
 from ..physics.mujoco import MujocoPhysics
 from .assembly import assemble
-from .beside_losses import Sought
-from .chance import chances, detectable, of_chance, unseen
 from .holds import bridged
 from .late_sensors import LATE, free_riders, without_free_riders
-from .loss_suspects import Suspects
-from .losses import losses
-from .lost_commands import beside_lost_commands
-from .lost_samples import beside_lost_samples
 from .modes import MODES
 from .objective import Point, Unit, pushes_of, units_of
 from .onsets import with_onsets
 from .preparation import Prepared, prepare
 from .prepared_anew import with_less_noise
 from .report import Report
-from .scatter import Scatter, gap_with_holds
 from .selection import Selection, select
 from .shapes import SHAPED, shaped, with_shapes
+from .with_chance import with_chance
 
 _ALPHA = 0.01
 _TOO_SHORT = (
@@ -120,31 +114,22 @@ def diagnose(
         search = partial(_searched, system, units=units, generator=generator, progress=progress)
         alarms, prepared, selection = _beside_noise(search, prepared, generator)
         progress("looking for scatter")
-        random, suspects = of_chance(every), Suspects.of(prepared, selection, every)
-        found = losses(prepared, selection, suspects) if suspects else []
-        sent, recorded = None, 1.0
-        if holds:
-            recorded = gap_with_holds(prepared, logs, selection)
-        elif suspects:
-            seen = replace(prepared, alarms=alarms)
-            sought = Sought(seen, selection, found, suspects, search, generator)
-            if beside := beside_lost_commands(sought) or beside_lost_samples(sought):
-                prepared, selection, found, sent = beside.told()
-        found = found or chances(prepared.sets, selection, random)
-        hidden = [] if found else unseen(prepared.sets, selection, random)
+        prepared, selection, scatter = with_chance(
+            prepared,
+            selection,
+            logs=logs,
+            units=every,
+            holds=holds,
+            alarms=alarms,
+            search=search,
+            generator=generator,
+        )
         progress("opening the test runs")
         return assemble(
             system,
             prepared=prepared,
             selection=selection,
-            scatter=Scatter(
-                found,
-                detectable(prepared.sets["train"], selection, random),
-                holds,
-                recorded,
-                hidden,
-                sent,
-            ),
+            scatter=scatter,
             findings=findings,
             generator=generator,
             begun=begun,

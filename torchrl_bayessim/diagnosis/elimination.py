@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from .form_fit import bendable, priced, with_forms_anew
-from .model import Model, as_good, criterion, gain, judged, needed
+from .model import Model, as_good, criterion, judged, shown
 from .objective import Objective, Point, Unit
 from .refit import refit
 
@@ -33,9 +33,8 @@ def eliminated(train: Objective, validation: Objective, model: Model) -> tuple[M
         tried += smaller
         criteria = [criterion(m, model.dispersion()) for m in smaller]
         best = int(np.argmin(criteria))
-        loss = gain(smaller[best], model)
         worse = criteria[best] > criterion(model, model.dispersion())
-        needs = loss > needed(smaller[best], model) or _without_doubt(smaller[best], model)
+        needs = shown(smaller[best], model) or _without_doubt(smaller[best], model)
         if worse and needs:
             idle = _idle_place(model, smaller)
             if idle is None:

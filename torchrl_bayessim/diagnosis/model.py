@@ -14,6 +14,7 @@ __all__ = [
     "needed",
     "numbers",
     "price",
+    "shown",
 ]
 
 from collections.abc import Iterable, Sequence, Set
@@ -30,6 +31,7 @@ Array = NDArray[np.float64]
 LIKELY = 6.0  # a deviance that chance often makes
 _CHANCE = 0.01  # of a test that two models explain the data equally well
 _WORSE = 1.5  # times the misfit of the best model: too much for an equal, however few the data
+_CERTAIN, _SEVERAL = 5.0, 2  # times what judging runs must gain; runs of the fit that gain it
 WHITE = 1.2  # mean squared innovation of a model that leaves noise alone
 
 
@@ -116,6 +118,24 @@ def gain(base: Model, model: Model) -> float:
 def needed(base: Model, model: Model) -> float:
     """Return the gain on validation that more strengths need: the chance level per strength."""
     return 4.0 * max(1, len(model.units) - len(base.units))
+
+
+def shown(base: Model, model: Model) -> bool:
+    """Return whether segments that no fit saw show that a model is better than its base.
+
+    Or those of several runs of the fit, beyond doubt, if the others do not disagree: what shows in
+    some motions only need not be in the runs that judge.
+    """
+    if gain(base, model) > needed(base, model):
+        return True
+    if not base.units or gain(base, model) < 0:
+        return False
+    count = len(model.fit.innovations)
+    logs = model.logs[:count]
+    better = (base.deviances() - model.deviances())[:count] / model.dispersion()
+    each = np.bincount(logs, better)
+    runs = int((each > _CERTAIN * needed(base, model)).sum())
+    return runs >= _SEVERAL and not (each < -LIKELY).any()
 
 
 def as_good(best: Model, rival: Model) -> bool:

@@ -194,7 +194,11 @@ class Objective:
 
     def weighted(self, point: Point) -> Objective:
         """Return the same with the robust weights that the segments deserve at a point."""
-        return self._but(whitening=self.whitening.weighted(self([point])[0]))
+        return self.whitened(self.whitening.weighted(self([point])[0]))
+
+    def whitened(self, whitening: Whitening) -> Objective:
+        """Return the same with another covariance, or other weights."""
+        return self._but(whitening=whitening)
 
     def _but(self, **changes: Any) -> Objective:
         other = copy.copy(self)

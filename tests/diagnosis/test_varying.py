@@ -1,0 +1,79 @@
+"""What varies by chance widens the covariance, and no longer hides what else is missing."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from plain_models import A, C
+from scipy.stats import multivariate_normal
+
+from torchrl_bayessim.diagnosis.model import Model, shown
+from torchrl_bayessim.diagnosis.objective import Objective, Point
+from torchrl_bayessim.diagnosis.refit import Fit
+from torchrl_bayessim.diagnosis.varying import _cost, _widened
+from torchrl_bayessim.diagnosis.whitening import Whitening
+
+SEGMENTS, NUMBERS, DRAWS = 5, 6, 3
+
+
+def roots():
+    return np.random.default_rng(0).normal(size=(SEGMENTS, NUMBERS, DRAWS))
+
+
+def test_the_deviance_is_that_of_the_wider_normal_distribution():
+    left = np.random.default_rng(1).normal(size=(SEGMENTS, NUMBERS))
+    wider = [np.eye(NUMBERS) + root @ root.T for root in roots()]
+    both = [
+        -2
+        * sum(multivariate_normal(cov=cov).logpdf(row) for row, cov in zip(left, of, strict=True))
+        for of in (wider, [np.eye(NUMBERS)] * SEGMENTS)
+    ]
+    gained = _cost(left, roots()) - (left**2).sum()
+    assert gained == pytest.approx(both[0] - both[1])
+
+
+def test_innovations_of_what_varies_so_are_white_again():
+    rng = np.random.default_rng(2)
+    factor = np.tril(rng.normal(size=(SEGMENTS, NUMBERS, NUMBERS))) + 3 * np.eye(NUMBERS)
+    ones, drift = np.ones(SEGMENTS), rng.normal(size=(SEGMENTS, NUMBERS))
+    white = Whitening(np.linalg.inv(factor), ones, ones[:, None, None], drift, 0.0)
+    now = _widened(Objective(None, None, None, white), roots()).whitening
+    for old, new, root, before, after in zip(
+        factor, now.inverse, roots(), drift, now.drift, strict=True
+    ):
+        covariance = old @ (np.eye(NUMBERS) + root @ root.T) @ old.T
+        assert new @ covariance @ new.T == pytest.approx(np.eye(NUMBERS), abs=1e-9)
+        # what the time step makes is the same residual as before
+        assert np.linalg.solve(new, after) == pytest.approx(old @ before)
+    assert now.weights is white.weights
+
+
+def of_runs(train, judged, units):
+    """Return a model that leaves so much of each of the fit's runs, and of those that judge."""
+    left = np.sqrt(np.array(train))[:, None]
+    fit = Fit(Point(np.zeros(1), dict.fromkeys(units, 1.0)), units, left, np.zeros((len(left), 1)))
+    return Model(fit, np.full((1, 1), judged**0.5), np.arange(len(left) + 1))
+
+
+@pytest.mark.parametrize(
+    ("train", "judged", "better"),
+    [
+        ([1, 1, 100], 0.5, True),  # who judges sees it
+        ([1, 1, 100], 2.0, True),  # two runs do, plainly, and the judge does not disagree
+        ([1, 1, 100], 3.5, False),  # it disagrees
+        ([1, 95, 100], 2.0, False),  # one run only
+        ([1, 1, 130], 2.0, False),  # another run disagrees
+    ],
+)
+def test_what_runs_of_the_fit_show_plainly_need_not_be_in_those_that_judge(train, judged, better):
+    judge = 10.0 if judged < 1 else 3.0
+    base = of_runs([100, 100, 100], judge, (A,))
+    assert shown(base, of_runs(train, judged, (A, C))) is better
+    first = of_runs([100, 100, 100], judge, ())  # a first effect has to show where it is judged
+    assert shown(first, of_runs(train, judged, (C,))) is (judged < 1)
+
+
+def test_a_model_without_effects_varies_in_nothing():
+    from torchrl_bayessim.diagnosis.varying import varying
+
+    assert varying(SimpleNamespace(), SimpleNamespace(units=()), (), ()) is None

@@ -1,0 +1,80 @@
+"""What chance does, in the place of what lasts or beside it, and what is found beside that."""
+
+from __future__ import annotations
+
+__all__ = ["with_chance"]
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..logs.log import Log
+from .beside_losses import Sought
+from .chance import chances, detectable, of_chance, unseen
+from .holds import Hold
+from .loss_suspects import Suspects
+from .losses import losses
+from .lost_commands import beside_lost_commands
+from .lost_samples import beside_lost_samples
+from .objective import Unit
+from .preparation import Prepared
+from .scatter import Scatter, gap_with_holds
+from .selection import Selection
+from .varying import varying, with_variation
+
+Search = Callable[..., tuple[Prepared, Selection]]
+
+
+def with_chance(
+    prepared: Prepared,
+    selection: Selection,
+    *,
+    logs: Sequence[Log],
+    units: Sequence[Unit],
+    holds: Sequence[Hold],
+    alarms: tuple[str, ...],
+    search: Search,
+    generator: np.random.Generator,
+) -> tuple[Prepared, Selection, Scatter]:
+    """Return what was found of chance, and of what lasts beside it.
+
+    Args:
+        prepared: What the search for what lasts started from.
+        selection: What it found.
+        logs: As they were recorded.
+        units: Effects at their targets, those of chance among them.
+        holds: Channels whose samples were not always renewed.
+        alarms: From before that search.
+        search: Searches for effects that last.
+        generator: Of simulated noise.
+    """
+    random, suspects = of_chance(units), Suspects.of(prepared, selection, units)
+    found = losses(prepared, selection, suspects) if suspects else []
+    sent, recorded = None, 1.0
+    if holds:
+        recorded = gap_with_holds(prepared, logs, selection)
+    elif suspects:
+        seen = replace(prepared, alarms=alarms)
+        sought = Sought(seen, selection, found, suspects, search, generator)
+        if beside := beside_lost_commands(sought) or beside_lost_samples(sought):
+            prepared, selection, found, sent = beside.told()
+    found = found or chances(prepared.sets, selection, random)
+    if sent is None and not holds and not any(chance.beside for chance in found):
+        more = _beside_variation(search, prepared, selection, random)
+        if more is not None:
+            found, (prepared, selection) = [], more
+    least = detectable(prepared.sets["train"], selection, random)
+    hidden = [] if found else unseen(prepared.sets, selection, random)
+    return prepared, selection, Scatter(found, least, holds, recorded, hidden, sent)
+
+
+def _beside_variation(
+    search: Search, prepared: Prepared, selection: Selection, random: Sequence[Unit]
+) -> tuple[Prepared, Selection] | None:
+    """Return what is found beside effects that vary by chance, nothing if it is no more."""
+    found = varying(prepared, selection.best, selection.offered, random)
+    if found is None:
+        return None
+    wider, more = search(with_variation(prepared, found), known=selection)
+    return (wider, more) if more.best.names > selection.best.names else None
