@@ -60,23 +60,22 @@ def run(rng, steps, *, act=lambda u, k: u[k], push=lambda q, v: 0.0, xml=ARM):
     return state, u
 
 
+def as_log(name, state, u):
+    """Return a log of positions and velocities of the arm's hinge, ``(T, 2)``."""
+    return Log(
+        name=name,
+        time=0.01 * torch.arange(len(u)).double(),
+        qpos=torch.from_numpy(state[:, :1].copy()),
+        qvel=torch.from_numpy(state[:, 1:].copy()),
+        ctrl=torch.from_numpy(u[:, None].copy()),
+        velocity_gain=torch.zeros(1).double(),
+        measured=torch.ones(2, dtype=torch.bool),
+    )
+
+
 def logs(count=6, steps=200, seed=0, **cause):
     rng = np.random.default_rng(seed)
-    result = []
-    for i in range(count):
-        state, u = run(rng, steps, **cause)
-        result.append(
-            Log(
-                name=f"run{i}",
-                time=0.01 * torch.arange(steps).double(),
-                qpos=torch.from_numpy(state[:, :1].copy()),
-                qvel=torch.from_numpy(state[:, 1:].copy()),
-                ctrl=torch.from_numpy(u[:, None].copy()),
-                velocity_gain=torch.zeros(1).double(),
-                measured=torch.ones(2, dtype=torch.bool),
-            )
-        )
-    return result
+    return [as_log(f"run{i}", *run(rng, steps, **cause)) for i in range(count)]
 
 
 SOME = (

@@ -2,15 +2,18 @@
 
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 from plain_models import A, C
 from scipy.stats import multivariate_normal
+from test_diagnose import ARM, FINER, as_log, commands, system
 
+from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.model import Model, shown
 from torchrl_bayessim.diagnosis.objective import Objective, Point
 from torchrl_bayessim.diagnosis.refit import Fit
-from torchrl_bayessim.diagnosis.varying import _cost, _widened
+from torchrl_bayessim.diagnosis.varying import _cost, _widened, varying
 from torchrl_bayessim.diagnosis.whitening import Whitening
 
 SEGMENTS, NUMBERS, DRAWS = 5, 6, 3
@@ -74,6 +77,39 @@ def test_what_runs_of_the_fit_show_plainly_need_not_be_in_those_that_judge(train
 
 
 def test_a_model_without_effects_varies_in_nothing():
-    from torchrl_bayessim.diagnosis.varying import varying
-
     assert varying(SimpleNamespace(), SimpleNamespace(units=()), (), ()) is None
+
+
+def sampled(rng, steps, drag, jitter):
+    """Return what sensors that are two samples late, more or less, show of an arm with drag."""
+    model = mujoco.MjModel.from_xml_string(ARM)
+    model.body_mass[1] *= 1.1
+    model.body_inertia[1] *= 1.1
+    model.opt.timestep /= FINER
+    data = mujoco.MjData(model)
+    data.qpos[0] = rng.normal(scale=0.5)
+    u, fine, each = commands(rng, steps), [], 5 * FINER
+    for k in range(steps * each):
+        fine.append((data.qpos[0], data.qvel[0]))
+        data.ctrl[0] = u[k // each]
+        data.qfrc_applied[0] = -drag * data.qvel[0] * abs(data.qvel[0])
+        mujoco.mj_step(model, data)
+    at = each * (np.arange(steps) - 2 - jitter * rng.uniform(-1, 1, steps))
+    state = [np.interp(at, np.arange(len(fine)), one) for one in np.transpose(fine)]
+    return np.stack(state, 1) + rng.normal(size=(steps, 2)) * [0.002, 0.02], u
+
+
+@pytest.mark.parametrize(("drag", "jitter"), [(0.003, 0.6), (0.0, 0.5)])
+def test_drag_is_found_beside_samples_that_are_late_by_other_times_and_only_where_it_is(
+    drag, jitter
+):
+    rng = np.random.default_rng(0)
+    data = [as_log(f"run{i}", *sampled(rng, 200, drag, jitter)) for i in range(6)]
+    effects = "action_delay", "sensor_delay", "action_lag", "quadratic_drag", "coulomb_friction"
+    report = diagnose(system(), None, data, effects=effects)
+    assert report.effects[0].name in {"action_delay", "action_lag"}
+    named = {effect.name: effect.strength for effect in report.effects[1:]}
+    assert named == ({"quadratic_drag": pytest.approx(drag, rel=0.2)} if drag else {})
+    noted = [alarm for alarm in report.alarms if "that counts as noise here" in alarm]
+    assert len(noted) == bool(drag)
+    assert report.gap.with_effects > 2  # what varies is a part of the gap

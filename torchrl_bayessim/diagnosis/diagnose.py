@@ -40,6 +40,7 @@ from .shapes import SHAPED, shaped, with_shapes
 from .with_chance import with_chance
 
 _ALPHA = 0.01
+_SURELY = 1e-3  # the same, where what varies counts as noise
 _TOO_SHORT = (
     "sensors that are late were left out: over {} control steps they show what was measured before"
 )
@@ -164,6 +165,7 @@ def _searched(
     generator: np.random.Generator,
     progress: Callable[[str], None],
     known: Selection | None = None,
+    varied: bool = False,
 ) -> tuple[Prepared, Selection]:
     """Search for effects that last; an alarm where sensors that are late had to be left out."""
     shapes = partial(_shapes, system, prepared, units)
@@ -178,8 +180,9 @@ def _searched(
         prepared.sets["validation"],
         prepared.nominal,
         known=known,
+        varied=varied,
         shapes=shapes,
-        alpha=_ALPHA,
+        alpha=_SURELY if varied else _ALPHA,
         generator=generator,
         progress=progress,
     )

@@ -8,7 +8,7 @@ under another name, and stands beside it as its rival.
 
 from __future__ import annotations
 
-__all__ = ["identified", "nothing_left", "stands_apart", "surely_elsewhere"]
+__all__ = ["identified", "no_rival", "nothing_left", "stands_apart", "surely_elsewhere"]
 
 import math
 from collections.abc import Mapping, Sequence
@@ -179,6 +179,14 @@ def _within_a_step(base: Model, better: Model, timestep: float) -> bool:
     strengths = better.fit.point.strengths
     delays = [u for u in strengths if u not in base.units and u.name in _DELAYS]
     return not any(unit.actual(strengths[unit]) > timestep for unit in delays)
+
+
+def no_rival(base: Model, better: Model, models: Sequence[Model], **_: object) -> bool:
+    """Return whether no effect of another kind mends a base as well, where all that is left counts.
+
+    Where what varies counts as noise, what is left says nothing of how much is missing.
+    """
+    return not base.units or not _rivalled(base, better, models)
 
 
 def _rivalled(base: Model, better: Model, models: Sequence[Model]) -> bool:

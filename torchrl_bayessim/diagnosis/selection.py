@@ -23,7 +23,7 @@ from .choice import chosen, fewest
 from .elimination import eliminated, without_stopgaps
 from .explanations import bent, compare, explanations
 from .form_fit import with_fitted_forms, with_forms_anew
-from .further_effects import identified, nothing_left, stands_apart
+from .further_effects import identified, no_rival, nothing_left, stands_apart
 from .model import LIKELY, WHITE, Model, judged
 from .objective import Objective, Point, Unit
 from .refit import Fit, refit
@@ -83,6 +83,7 @@ def select(
     units: Sequence[Unit],
     *,
     known: Selection | None = None,
+    varied: bool = False,
     shapes: Callable[[Point], Sequence[Unit]] = lambda _: (),
     alpha: float = 0.01,
     generator: np.random.Generator,
@@ -96,6 +97,7 @@ def select(
         nominal: The fit of the parameters alone.
         units: The effects to consider, at each of their targets.
         known: What was found before, with another noise: the search goes on from there.
+        varied: Whether what varies counts as noise: less than white noise may still hold an effect.
         shapes: Returns those among them that have a frequency or a step, as they are seen beside
             what is in the model already.
         alpha: Level of the test that anything is missing, in every round.
@@ -105,7 +107,8 @@ def select(
     start = judged(train, validation, [nominal])[0]
     search = _Search(
         train, validation, start, units,
-        known=known, shapes=shapes, alpha=alpha, generator=generator, progress=progress,
+        known=known, varied=varied,
+        shapes=shapes, alpha=alpha, generator=generator, progress=progress,
     )  # fmt: skip
     needs = search.best()
     instead = partial(
@@ -130,15 +133,16 @@ class _Search:
         offered: Sequence[Unit],
         *,
         known: Selection | None,
+        varied: bool,
         shapes: Callable[[Point], Sequence[Unit]],
         alpha: float,
         generator: np.random.Generator,
         progress: Callable[[str], None],
     ) -> None:
         self.sets, self.start, self.offered = (train, validation), start, offered
-        self.known, self.shapes, self.alpha = known, shapes, alpha
+        self.known, self.shapes, self.alpha, self.varied = known, shapes, alpha, varied
         self.generator, self.progress = generator, progress
-        self.worth = _worth(start, train)
+        self.worth = no_rival if varied else _worth(start, train)
         self.units: Sequence[Unit] = offered
         self.tried, self.screens, self.p_values = [start], list[Screen](), list[float]()
 
@@ -161,7 +165,8 @@ class _Search:
         """Return the model with what it lacks most; nothing where it lacks nothing."""
         train = self.sets[0]
         self.progress(f"screening {len(self.units)} effects, round {len(self.screens) + 1}")
-        enough, self.units = nothing_left(self.start, best), _with_forms(self.units, best)
+        enough = nothing_left(self.start, best) and not self.varied
+        self.units = _with_forms(self.units, best)
         left = [u for u in self.units if u not in best.units]
         if best.units and not enough:
             left = with_shapes(left, _beside(best, self.shapes(best.fit.point)))
@@ -179,6 +184,8 @@ class _Search:
             return None
         self.progress("fitting explanations")
         models = judged(*self.sets, explanations(train, now))
+        if self.varied:  # several at once make up for a variation that is not quite known
+            models = [model for model in models if len(model.names - best.names) < 2]
         self.tried += models
         worth = partial(self.worth, seen=now.seen)
         better = chosen(best, models)

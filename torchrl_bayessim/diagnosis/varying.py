@@ -35,9 +35,9 @@ from .preparation import Prepared
 from .refit import refit
 
 Array = NDArray[np.float64]
-_PARTS = (0.02, 0.05, 0.1, 0.2, 0.4)  # of a strength that wavers: standard deviations
+_PARTS = np.geomspace(0.02, 0.5, 12)  # of a strength that wavers: standard deviations
 _LEVELS = (0.05, 0.12, 0.25, 0.5, 1.0)  # of the range of an effect of chance
-_TIMES = (0.02, 0.05, 0.1, 0.2, 0.4)  # of a control step: standard deviations
+_TIMES = np.geomspace(0.02, 0.6, 12)  # of a control step: standard deviations
 _STEP = 0.1  # of a strength, to see what it changes
 _DRAWS = 32
 _LATE = "timing"  # the group of effects that are late
@@ -53,10 +53,12 @@ class Varying:
 
     Attributes:
         what: In words, with its size.
+        group: Of the effect that varies.
         roots: By name of the split, shape ``(S, M, R)``: ``Σ_i = roots_i roots_iᵀ``.
     """
 
     what: str
+    group: str
     roots: Mapping[str, Array]
 
 
@@ -114,7 +116,11 @@ def _wavering(sets: Mapping[str, Objective], point: Point, unit: Unit) -> list[V
     change = {name: _change(one, point, unit)[..., None] for name, one in sets.items()}
     what = f"{plain(unit.name)} at {unit.where} varies by {{:.0f}} % of itself"
     return [
-        Varying(what.format(100 * part), {name: part * each for name, each in change.items()})
+        Varying(
+            what.format(100 * part),
+            unit.effect.group,
+            {name: part * each for name, each in change.items()},
+        )
         for part in _PARTS
     ]
 
@@ -137,6 +143,7 @@ def _sampled(sets: Mapping[str, Objective], point: Point, offered: Sequence[Unit
     return [
         Varying(
             f"samples are late by times that vary by {part * dt:.2g} s",
+            _LATE,
             {name: part * dt * each for name, each in rows.items()},
         )
         for part in _TIMES
@@ -144,15 +151,22 @@ def _sampled(sets: Mapping[str, Objective], point: Point, offered: Sequence[Unit
 
 
 def _by_rows(objective: Objective, point: Point, unit: Unit, step: float) -> Array:
-    """Return what a second of delay changes at each row alone, and at all, ``(S, M, K + 1)``."""
+    """Return what a second of delay changes at each row, and at the start, ``(S, M, K + 1)``."""
+    predictor, segments = objective.predictor, objective.segments
+    late = strengths_of([Point(point.z, {unit: step})], predictor.system.robot)
+    ahead = predictor.sensing.restored(segments, late, 1)
+    begin = np.zeros((len(segments), 2 * predictor.tangent.size))
+    if ahead is not None:
+        begin[:, predictor.sensing.channels] = ahead[0, :, segments.history]
     more = {**point.strengths, unit: point.strengths.get(unit, 0.0) + step}
     before, after = objective.raw([point, Point(point.z, more)])
-    change = (after - before) / step
+    start = (objective.raw([point], segments.freed(begin)[None])[0] - before) / step
+    change = (after - before) / step - start
     size, rows, channels = change.shape
     alone = np.zeros((size, rows, channels, rows + 1))
     for k in range(rows):
         alone[:, k, :, k] = change[:, k]
-    alone[..., rows] = change
+    alone[..., rows] = start
     columns = alone.reshape(size, rows * channels, rows + 1)
     return np.asarray(objective.whitening.inverse @ columns, dtype=np.float64)
 
@@ -165,7 +179,8 @@ def _drawn(sets: Mapping[str, Objective], point: Point, unit: Unit) -> list[Vary
         what = f"commands come late by up to {strength:.2g} {unit.effect.unit} more at {unit.where}"
         if unit.effect.unit != "s":
             what = f"commands come late at {unit.where}, one of {1 / strength:.0f}"
-        found.append(Varying(what, {name: _scatter(one, with_it) for name, one in sets.items()}))
+        roots = {name: _scatter(one, with_it) for name, one in sets.items()}
+        found.append(Varying(what, _LATE, roots))
     return found
 
 

@@ -76,5 +76,17 @@ def _beside_variation(
     found = varying(prepared, selection.best, selection.offered, random)
     if found is None:
         return None
-    wider, more = search(with_variation(prepared, found), known=selection)
-    return (wider, more) if more.best.names > selection.best.names else None
+    # of one kind with what varies, which is known roughly only, everything helps a little
+    others = [unit for unit in selection.offered if unit.effect.group != found.group]
+    known = replace(selection, offered=tuple(others))
+    wider, more = search(with_variation(prepared, found), known=known, varied=True)
+    if not more.best.names > selection.best.names:
+        return None
+    # what was seen of every effect where noise alone was noise
+    more = replace(
+        more,
+        screens=(selection.screens[0], *more.screens[1:]),
+        p_values=(selection.p_values[0], *more.p_values[1:]),
+        offered=selection.offered,
+    )
+    return wider, more
