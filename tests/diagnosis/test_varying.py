@@ -112,4 +112,8 @@ def test_drag_is_found_beside_samples_that_are_late_by_other_times_and_only_wher
     assert named == ({"quadratic_drag": pytest.approx(drag, rel=0.2)} if drag else {})
     noted = [alarm for alarm in report.alarms if "that counts as noise here" in alarm]
     assert len(noted) == bool(drag)
+    told = [alarm for alarm in report.alarms if "that explains what remains" in alarm]
+    assert len(told) == (not drag)
+    (alarm,) = noted or told
+    assert "samples are late by times that vary by 0.00" in alarm
     assert report.gap.with_effects > 2  # what varies is a part of the gap

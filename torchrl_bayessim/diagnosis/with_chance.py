@@ -17,6 +17,7 @@ from .loss_suspects import Suspects
 from .losses import losses
 from .lost_commands import beside_lost_commands
 from .lost_samples import beside_lost_samples
+from .model import WHITE
 from .objective import Unit
 from .preparation import Prepared
 from .scatter import Scatter, gap_with_holds
@@ -24,6 +25,7 @@ from .selection import Selection
 from .varying import varying, with_variation
 
 Search = Callable[..., tuple[Prepared, Selection]]
+_REST = "{}, as it seems: that explains what remains"
 
 
 def with_chance(
@@ -61,9 +63,9 @@ def with_chance(
             prepared, selection, found, sent = beside.told()
     found = found or chances(prepared.sets, selection, random)
     if sent is None and not holds and not any(chance.beside for chance in found):
-        more = _beside_variation(search, prepared, selection, random)
-        if more is not None:
-            found, (prepared, selection) = [], more
+        prepared, more = _beside_variation(search, prepared, selection, random)
+        if more is not selection:
+            found, selection = [], more
     least = detectable(prepared.sets["train"], selection, random)
     hidden = [] if found else unseen(prepared.sets, selection, random)
     return prepared, selection, Scatter(found, least, holds, recorded, hidden, sent)
@@ -71,17 +73,18 @@ def with_chance(
 
 def _beside_variation(
     search: Search, prepared: Prepared, selection: Selection, random: Sequence[Unit]
-) -> tuple[Prepared, Selection] | None:
-    """Return what is found beside effects that vary by chance, nothing if it is no more."""
+) -> tuple[Prepared, Selection]:
+    """Return what is found beside effects that vary by chance; the same if it is no more."""
     found = varying(prepared, selection.best, selection.offered, random)
     if found is None:
-        return None
+        return prepared, selection
     # of one kind with what varies, which is known roughly only, everything helps a little
     others = [unit for unit in selection.offered if unit.effect.group != found.group]
     known = replace(selection, offered=tuple(others))
     wider, more = search(with_variation(prepared, found), known=known, varied=True)
     if not more.best.names > selection.best.names:
-        return None
+        rest = more.best.mean_square < WHITE
+        return prepared.alarmed(_REST.format(found.what)) if rest else prepared, selection
     # what was seen of every effect where noise alone was noise
     more = replace(
         more,
