@@ -25,6 +25,7 @@ from .selection import Selection
 from .varying import varying, with_variation
 
 Search = Callable[..., tuple[Prepared, Selection]]
+_MOST = 150  # effects at their places that are searched through again
 _REST = "{}, as it seems: that explains what remains"
 
 
@@ -75,7 +76,9 @@ def _beside_variation(
     search: Search, prepared: Prepared, selection: Selection, random: Sequence[Unit]
 ) -> tuple[Prepared, Selection]:
     """Return what is found beside effects that vary by chance; the same if it is no more."""
-    found = varying(prepared, selection.best, selection.offered, random)
+    # of legs with twelve joints, once more through all of it takes too long
+    few = len(selection.offered) <= _MOST
+    found = varying(prepared, selection.best, selection.offered, random) if few else None
     if found is None:
         return prepared, selection
     # of one kind with what varies, which is known roughly only, everything helps a little
