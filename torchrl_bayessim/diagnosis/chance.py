@@ -14,7 +14,7 @@ leaves errors too, so an effect of chance must leave noise alone by its own stan
 
 from __future__ import annotations
 
-__all__ = ["Chance", "chances", "detectable", "of_chance", "unseen"]
+__all__ = ["Chance", "chances", "detectable", "drawn", "of_chance", "scattered", "unseen"]
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -92,27 +92,7 @@ class _Data:
 
     def draws(self, points: Sequence[Point], count: int = _DRAWS) -> Array:
         """Return what chance changes, shape ``(P, R, S, M)``."""
-        predictor = self.objective.predictor
-        found = []
-        try:
-            for draw in range(count):
-                predictor.realisation = 1 + draw
-                found.append(self._changed(points))
-        finally:
-            predictor.realisation = 0
-        return np.stack(found, 1)
-
-    def _changed(self, points: Sequence[Point]) -> Array:
-        predictor = self.objective.predictor
-        strengths = strengths_of(points, predictor.system.robot)
-        seed = predictor.realisation
-        offsets = predictor.sensing.scattered(self.objective.segments, strengths, seed=seed)
-        return self.innovations(points, offsets) - self.left
-
-    def innovations(self, points: Sequence[Point], offsets: Array | None = None) -> Array:
-        """Return innovations without the robust weights, shape ``(P, S, M)``."""
-        weights = self.objective.whitening.weights[:, None]
-        return self.objective(points, offsets) / weights
+        return drawn(self.objective, points, count) - self.left
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +213,7 @@ def _calm(selection: Selection) -> bool:
 
 def _without(judged: Sequence[_Data], point: Point) -> Array:
     """Return deviances of an explanation without chance, of evenly spread scatter, by segment."""
-    left = [(data.innovations([point])[0] ** 2) for data in judged]
+    left = [(data.objective.unweighted([point])[0] ** 2) for data in judged]
     squares = np.concatenate([r.sum(-1) for r in left])
     size = np.concatenate([np.full(len(r), r.shape[1]) for r in left])
     costs = squares / _SCATTER[:, None] + size * np.log(_SCATTER)[:, None]
@@ -241,11 +221,11 @@ def _without(judged: Sequence[_Data], point: Point) -> Array:
 
 
 def _told(judged: Sequence[_Data], points: Sequence[Point]) -> list[_Told]:
-    drawn = [data.draws(points) for data in judged]
+    made = [data.draws(points) for data in judged]
     told = []
     for p in range(len(points)):
-        change = _change(judged[0], drawn[0][p])
-        found = [_deviance(data, d[p], change) for data, d in zip(judged, drawn, strict=True)]
+        change = _change(judged[0], made[0][p])
+        found = [_deviance(data, d[p], change) for data, d in zip(judged, made, strict=True)]
         costs = np.concatenate([cost for cost, _, _ in found])
         told.append(_Told(change, costs, max(phi for _, phi, _ in found)))
     return told
@@ -268,10 +248,28 @@ def _change(data: _Data, drawn: Array) -> Array:
     return np.asarray(change, dtype=np.float64)
 
 
+def drawn(objective: Objective, points: Sequence[Point], count: int) -> Array:
+    """Return innovations without the robust weights as chance draws them, ``(P, R, S, M)``."""
+    predictor, found = objective.predictor, []
+    strengths = strengths_of(points, predictor.system.robot)
+    try:
+        for draw in range(count):
+            predictor.realisation = seed = 1 + draw
+            offsets = predictor.sensing.scattered(objective.segments, strengths, seed=seed)
+            found.append(objective.unweighted(points, offsets))
+    finally:
+        predictor.realisation = 0
+    return np.stack(found, 1)
+
+
+def scattered(draws: Array) -> Array:
+    """Return a root of the covariance of draws ``(R, S, M)`` in each segment, ``(S, R, M)``."""
+    return np.asarray((draws - draws.mean(0)).transpose(1, 0, 2) / np.sqrt(len(draws) - 1))
+
+
 def _spectrum(drawn: Array) -> tuple[Array, Array]:
     """Return eigenvalues ``(S, R)`` and eigenvectors ``(S, R, M)`` of what chance scatters."""
-    centred = (drawn - drawn.mean(0)).transpose(1, 0, 2) / np.sqrt(len(drawn) - 1)
-    _, roots, vectors = np.linalg.svd(centred, full_matrices=False)
+    _, roots, vectors = np.linalg.svd(scattered(drawn), full_matrices=False)
     return roots**2, vectors
 
 

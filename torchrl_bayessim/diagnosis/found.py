@@ -16,7 +16,7 @@ from ..effects.sensors import SensorDropout
 from .candidates import strength_errors
 from .confusion import confusion_set
 from .model import gain, needed
-from .objective import Objective, Point, Unit, strengths_of
+from .objective import Objective, Point, Unit, at_targets, strengths_of
 from .preparation import Prepared
 from .report import Finding
 from .scatter import Scatter, Sent
@@ -195,16 +195,6 @@ def _by_target(point: Point, robot: Robot) -> dict[Effect, dict[str, float]]:
     }
 
 
-def _at_targets(strengths: Mapping[Unit, float], robot: Robot) -> dict[str, float]:
-    """Return the strength at each target, of those that act at all at once in proportion."""
-    found: dict[str, float] = {}
-    for unit, strength in strengths.items():
-        for target, part in zip(unit.effect.targets(robot), unit.direction, strict=True):
-            if part:
-                found[target] = found.get(target, 0.0) + part * strength
-    return found
-
-
 def _together(
     units: Sequence[Unit], strengths: Sequence[float], errors: Sequence[float]
 ) -> tuple[float, float]:
@@ -240,7 +230,7 @@ def _effects(
                 ci95=(mean - 1.96 * error, mean + 1.96 * error),
                 p_value=p_value,
                 share_of_gap=max(0.0, credit[name] * measured.explained),
-                strengths=_at_targets(dict(zip(units, strengths, strict=True)), robot),
+                strengths=at_targets(dict(zip(units, strengths, strict=True)), robot),
                 form=units[int(np.argmax(np.abs(strengths)))].effect.form,
                 rivals=confused[1:],
             )

@@ -17,6 +17,7 @@ __all__ = [
     "Objective",
     "Point",
     "Unit",
+    "at_targets",
     "origin",
     "parameters_at",
     "pushes_of",
@@ -220,6 +221,20 @@ class Objective:
         share = np.array([point.z[-1] for point in points])
         drift = self.whitening.drift * self.whitening.weights[:, None]
         return self.whitening(self.raw(points, offsets)) - share[:, None, None] * drift
+
+    def unweighted(self, points: Sequence[Point], offsets: Array | None = None) -> Array:
+        """Return innovations without the robust weights, shape ``(P, S, KC)``."""
+        return self(points, offsets) / self.whitening.weights[:, None]
+
+
+def at_targets(strengths: Mapping[Unit, float], robot: Robot) -> dict[str, float]:
+    """Return the strength at each target, of those that act at all at once in proportion."""
+    found: dict[str, float] = {}
+    for unit, strength in strengths.items():
+        for target, part in zip(unit.effect.targets(robot), unit.direction, strict=True):
+            if part:
+                found[target] = found.get(target, 0.0) + part * strength
+    return found
 
 
 def origin(prior: Prior | None) -> Array:

@@ -9,14 +9,12 @@ __all__ = ["dry_friction", "dry_friction_alarms", "told_together"]
 
 from collections.abc import Mapping
 
-import numpy as np
-
 from ..effects.friction import StribeckFriction
 from ..effects.joints import CoulombFriction
 from ..effects.robot import Robot
 from .cells import plain
 from .model import Model
-from .objective import Unit
+from .objective import at_targets
 
 _LAWS = CoulombFriction.name, StribeckFriction.name
 
@@ -50,8 +48,8 @@ def dry_friction(model: Model, credit: Mapping[str, float], robot: Robot) -> dic
     if not set(_LAWS) <= set(model.names):
         return {}
     first, second = sorted(_LAWS, key=lambda name: -credit[name])
-    there = _joints(model, first, robot)
-    return {second: first} if _joints(model, second, robot) <= there else {}
+    there, others = (_by_joint(model, name, robot).keys() for name in (first, second))
+    return {second: first} if others <= there else {}
 
 
 def dry_friction_alarms(model: Model, told: Mapping[str, str], robot: Robot) -> list[str]:
@@ -62,22 +60,15 @@ def dry_friction_alarms(model: Model, told: Mapping[str, str], robot: Robot) -> 
         told: What is told with another; by :func:`dry_friction`, and other effects.
         robot: Where they act.
     """
-    strengths = model.fit.point.strengths
-    total: dict[str, dict[int, float]] = {name: {} for name in _LAWS}
-    for unit in model.units:
-        for target, part in enumerate(unit.direction):
-            if unit.name in total and part:
-                joint = unit.effect.joint(robot, target)
-                known = total[unit.name].get(joint, 0.0)
-                total[unit.name][joint] = known + part * unit.actual(strengths[unit])
-    always, fading = (total[name] for name in _LAWS)
+    always, fading = (_by_joint(model, name, robot) for name in _LAWS)
     return [
-        f"friction at {robot.joints[joint]} fades with speed, from "
+        f"friction at {joint} fades with speed, from "
         f"{always[joint] + fading[joint]:.3g} to {always[joint]:.3g} {_measure(model, robot)}: in "
         f"the simulator {plain(first)} and {plain(second)} stand for it together"
         for second, first in told.items()
         if second in _LAWS
-        for joint in sorted(always.keys() & fading.keys())
+        for joint in robot.joints
+        if joint in always and joint in fading
     ]
 
 
@@ -86,10 +77,7 @@ def _measure(model: Model, robot: Robot) -> str:
     return unit.measured_in(robot)
 
 
-def _joints(model: Model, name: str, robot: Robot) -> set[int]:
-    units: list[Unit] = [unit for unit in model.units if unit.name == name]
-    return {
-        unit.effect.joint(robot, int(target))
-        for unit in units
-        for target in np.flatnonzero(unit.direction)
-    }
+def _by_joint(model: Model, name: str, robot: Robot) -> dict[str, float]:
+    """Return the strength of a law at each joint where it acts."""
+    strengths = model.fit.point.strengths
+    return at_targets({u: u.actual(strengths[u]) for u in model.units if u.name == name}, robot)

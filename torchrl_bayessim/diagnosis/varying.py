@@ -26,8 +26,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..effects.action import ActionDelay
 from ..effects.sensors import SensorDelay
 from .cells import plain
+from .chance import drawn, scattered
 from .model import WHITE, Model
 from .modes import Mode
 from .objective import Objective, Point, Unit, strengths_of
@@ -40,7 +42,7 @@ _LEVELS = (0.05, 0.12, 0.25, 0.5, 1.0)  # of the range of an effect of chance
 _TIMES = np.geomspace(0.02, 0.6, 12)  # of a control step: standard deviations
 _STEP = 0.1  # of a strength, to see what it changes
 _DRAWS = 32
-_LATE = "timing"  # the group of effects that are late
+_LATE = ActionDelay.group
 _NEEDED = 20.0  # deviance
 _AGAIN = 4  # steps of fits
 _WIDENED = "train", "validation"
@@ -81,7 +83,7 @@ def varying(
     if any(unit.effect.group == _LATE for unit in best.units):
         found += _sampled(sets, point, offered)
         found += [o for u in random if u.effect.group == _LATE for o in _drawn(sets, point, u)]
-    left = {name: _innovations(one, [point])[0] for name, one in sets.items()}
+    left = {name: one.unweighted([point])[0] for name, one in sets.items()}
     costs = [sum(_cost(left[name], root) for name, root in one.roots.items()) for one in found]
     least = int(np.argmin(costs))
     nothing = sum(float((one**2).sum()) for one in left.values())
@@ -104,13 +106,6 @@ def with_variation(prepared: Prepared, found: Varying) -> Prepared:
     return replace(prepared.alarmed(_NOTE.format(found.what)), sets=sets, nominal=nominal)
 
 
-def _innovations(
-    objective: Objective, points: Sequence[Point], offsets: Array | None = None
-) -> Array:
-    """Return innovations without the robust weights, shape ``(P, S, M)``."""
-    return objective(points, offsets) / objective.whitening.weights[:, None]
-
-
 def _wavering(sets: Mapping[str, Objective], point: Point, unit: Unit) -> list[Varying]:
     """Return a strength that is another in each segment, by several parts of itself."""
     change = {name: _change(one, point, unit)[..., None] for name, one in sets.items()}
@@ -128,7 +123,7 @@ def _wavering(sets: Mapping[str, Objective], point: Point, unit: Unit) -> list[V
 def _change(objective: Objective, point: Point, unit: Unit) -> Array:
     """Return what a unit changes altogether, as far as a small part of it tells, ``(S, M)``."""
     less = {**point.strengths, unit: (1 - _STEP) * point.strengths[unit]}
-    now, before = _innovations(objective, [point, Point(point.z, less)])
+    now, before = objective.unweighted([point, Point(point.z, less)])
     return np.asarray((now - before) / _STEP, dtype=np.float64)
 
 
@@ -155,12 +150,13 @@ def _by_rows(objective: Objective, point: Point, unit: Unit, step: float) -> Arr
     predictor, segments = objective.predictor, objective.segments
     late = strengths_of([Point(point.z, {unit: step})], predictor.system.robot)
     ahead = predictor.sensing.restored(segments, late, 1)
-    begin = np.zeros((len(segments), 2 * predictor.tangent.size))
+    begin = np.zeros((3, len(segments), 2 * predictor.tangent.size))
     if ahead is not None:
-        begin[:, predictor.sensing.channels] = ahead[0, :, segments.history]
+        begin[2][:, predictor.sensing.channels] = ahead[0, :, segments.history]
     more = {**point.strengths, unit: point.strengths.get(unit, 0.0) + step}
-    before, after = objective.raw([point, Point(point.z, more)])
-    start = (objective.raw([point], segments.freed(begin)[None])[0] - before) / step
+    points = [point, Point(point.z, more), point]
+    before, after, begun = objective.raw(points, segments.freed(begin))
+    start = (begun - before) / step
     change = (after - before) / step - start
     size, rows, channels = change.shape
     alone = np.zeros((size, rows, channels, rows + 1))
@@ -179,25 +175,10 @@ def _drawn(sets: Mapping[str, Objective], point: Point, unit: Unit) -> list[Vary
         what = f"commands come late by up to {strength:.2g} {unit.effect.unit} more at {unit.where}"
         if unit.effect.unit != "s":
             what = f"commands come late at {unit.where}, one of {1 / strength:.0f}"
-        roots = {name: _scatter(one, with_it) for name, one in sets.items()}
+        draws = {name: drawn(one, [with_it], _DRAWS)[0] for name, one in sets.items()}
+        roots = {name: scattered(each).transpose(0, 2, 1) for name, each in draws.items()}
         found.append(Varying(what, _LATE, roots))
     return found
-
-
-def _scatter(objective: Objective, point: Point) -> Array:
-    """Return a root of the covariance that effects of chance make, ``(S, M, R)``."""
-    predictor = objective.predictor
-    strengths = strengths_of([point], predictor.system.robot)
-    drawn = []
-    try:
-        for draw in range(_DRAWS):
-            predictor.realisation = 1 + draw
-            offsets = predictor.sensing.scattered(objective.segments, strengths, seed=1 + draw)
-            drawn.append(_innovations(objective, [point], offsets)[0])
-    finally:
-        predictor.realisation = 0
-    each = np.stack(drawn, -1)
-    return (each - each.mean(-1, keepdims=True)) / np.sqrt(_DRAWS - 1)
 
 
 def _cost(left: Array, roots: Array) -> float:
