@@ -2,8 +2,7 @@
 
 import pytest
 
-from torchrl_bayessim.diagnosis.found import _at_targets
-from torchrl_bayessim.diagnosis.objective import Unit
+from torchrl_bayessim.diagnosis.objective import Unit, at_targets
 from torchrl_bayessim.diagnosis.report import Candidate, Finding
 from torchrl_bayessim.diagnosis.sentence import _described, _ruled_out
 from torchrl_bayessim.effects.catalogue import effect
@@ -66,7 +65,7 @@ def finding(name, strengths, *, where, strength, form=None, unit="rad/s"):
 def test_what_acts_at_all_in_proportion_is_said_with_the_place_of_its_strength():
     robot = Robot(dt=0.01, channels=("q", "v"))
     unit = Unit(effect("sensor_bias"), "all", (0.25, 1.0), -1.0, 1.0)
-    strengths = _at_targets({unit: -0.024}, robot)
+    strengths = at_targets({unit: -0.024}, robot)
     assert strengths == {"q": pytest.approx(-0.006), "v": -0.024}
     said = _described(finding("sensor_bias", strengths, where="all", strength=-0.024))
     at_all = "sensor bias at all at once (-0.024 ± 0.01 rad/s at v, elsewhere in proportion"
