@@ -5,7 +5,7 @@ import torch
 
 from torchrl_bayessim.inference.features import ResidualFeatures
 from torchrl_bayessim.inference.mixture_gradients import log_density_and_pullback
-from torchrl_bayessim.inference.network import MixtureDensityNetwork
+from torchrl_bayessim.inference.network import MixtureDensityNetwork, widened
 from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
 from torchrl_bayessim.randomness import generator
 
@@ -33,7 +33,7 @@ def test_density_and_gradient_are_those_of_autograd(size, covariance, boxed, spr
     value = EDGE * (2 * torch.rand(2, 7, size, dtype=torch.float64, generator=draw) - 1)
     box = (torch.full((size,), -EDGE), torch.full((size,), EDGE)) if boxed else None
     raw.requires_grad_()
-    mixture = net.widened(raw, net.widening, net.contrast, net.tails)
+    mixture = widened(net.components_of(raw), net.widening, net.contrast, net.tails)
     diagonal = covariance == "diagonal"
     expected = TruncatedGaussianMixture(*mixture, box, diagonal=diagonal, points=8).formula(value)
     upstream = torch.randn(expected.shape, dtype=torch.float64, generator=draw)

@@ -8,6 +8,7 @@ from torchrl_bayessim.inference.descent import descend
 from torchrl_bayessim.inference.features import Features, FourierFeatures, NeuralFeatures
 from torchrl_bayessim.inference.fit import fit, fit_several
 from torchrl_bayessim.inference.losses import PosteriorLoss
+from torchrl_bayessim.inference.network import widened
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.inference.stacked import StackedNetworks, alike
@@ -354,7 +355,7 @@ def test_a_contrast_belongs_to_its_factor_and_pickles_of_before_have_none():
 def test_no_contrast_makes_a_point_of_a_component():
     net = posteriors()[0].network
     raw = torch.full((1, sum(net.sizes)), -60.0)
-    mixture = net.widened(raw, torch.ones(2), torch.full((2,), 2.0), torch.zeros(0))
+    mixture = widened(net.components_of(raw), torch.ones(2), torch.full((2,), 2.0), torch.zeros(0))
     assert mixture.scale_tril.norm(dim=-1).min().item() == pytest.approx(1e-4, rel=1e-3)
 
 

@@ -10,10 +10,11 @@ from tensordict import TensorDict
 from torchrl_bayessim.inference.averaged_posterior import AveragedPosterior
 from torchrl_bayessim.inference.ensemble import fit_together
 from torchrl_bayessim.inference.fit import fit
+from torchrl_bayessim.inference.network import widened
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
 from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
-from torchrl_bayessim.inference.widening import average, widen
+from torchrl_bayessim.inference.widening import _as_one, average, widen
 from torchrl_bayessim.randomness import generator
 
 PRIOR = GaussianPrior({"a": (0.0, 1.0)})
@@ -303,3 +304,24 @@ def test_pairs_on_the_rim_do_not_hide_how_sure_the_others_find_it():
         network.network.head.bias.copy_(torch.tensor([0.0, 0.0, -4.0]))
     assert prior.contains(theta).all()
     assert widen([network], pairs) > 2
+
+
+def test_what_is_tried_is_what_the_average_will_be():
+    """Networks of other components and covariances too."""
+    prior = BoxPrior({"a": (0.0, 1.0), "b": (0.1, 2.0)})
+    kinds: list[dict[str, Any]] = [
+        {"covariance": "diagonal", "components": 2},
+        {"covariance": "full", "components": 3},
+    ]
+    networks = [MixtureDensityPosterior(prior, 2, seed=7, **kind).network for kind in kinds]
+    summary = torch.randn(5, 2, generator=generator("tried"))
+    z = torch.rand(5, 2, generator=generator("tried at"))
+    scaling = torch.tensor([0.7, 1.2]), torch.tensor([0.9, 1.1]), torch.tensor([0.4])
+    shares = torch.tensor([0.3, 0.8])
+    together, nearer = _as_one([n.components_of(n.raw(n.scaled(summary))) for n in networks])
+    moved = together._replace(loc=together.loc + (1 - shares) * nearer)
+    tried = TruncatedGaussianMixture(*widened(moved, *scaling), prior.box)
+    for network in networks:
+        network.widening, network.contrast, network.tails = scaling
+    members = [TruncatedGaussianMixture(*network(summary), prior.box) for network in networks]
+    torch.testing.assert_close(tried.log_prob(z), average(members, shares).log_prob(z))

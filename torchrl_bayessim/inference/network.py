@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
-__all__ = ["Covariance", "MixtureDensityNetwork", "factor", "heavy_tailed", "melu"]
+__all__ = [
+    "Components",
+    "Covariance",
+    "MixtureDensityNetwork",
+    "factor",
+    "heavy_tailed",
+    "melu",
+    "widened",
+]
 
 import math
 from collections.abc import Iterable
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -39,6 +47,23 @@ def melu(z: Tensor) -> Tensor:
         tensor([True, True, True])
     """
     return z.clamp(max=0.0).exp() + z.relu() + FLOOR
+
+
+class Components(NamedTuple):
+    """What a network says of a mixture, before :func:`widened` makes the mixture of it.
+
+    Attributes:
+        logits: Log-weights, shape ``(*, K)``.
+        loc: Means, shape ``(*, K, D)``.
+        deviation: Marginal deviations, not yet bounded, shape ``(*, K, D)``.
+        slope: Of :func:`factor`, shape ``(*, K, D (D - 1) / 2)``, or ``(*, K, 0)`` without
+            correlations.
+    """
+
+    logits: Tensor
+    loc: Tensor
+    deviation: Tensor
+    slope: Tensor
 
 
 class MixtureDensityNetwork(nn.Module):
@@ -146,46 +171,49 @@ class MixtureDensityNetwork(nn.Module):
     def forward(self, summary: Tensor) -> Mixture:
         """Return the mixture for summaries ``(*, L)``."""
         raw = self.raw(self.scaled(summary))
-        return self.widened(raw, self.widening, self.contrast, self.tails)
+        return widened(self.components_of(raw), self.widening, self.contrast, self.tails)
 
     def raw(self, scaled: Tensor) -> Tensor:
         """Return the last layer's values for what :meth:`scaled` made of summaries, ``(*, L)``.
 
-        From them :meth:`widened` makes the mixture.
+        :meth:`components_of` says what they mean.
         """
         return self.head(self.features(scaled))
 
-    def widened(self, raw: Tensor, widening: Tensor, contrast: Tensor, tails: Tensor) -> Mixture:
-        """Return the mixture of :meth:`raw` values, wider or narrower, or of heavier tails.
-
-        Args:
-            raw: Values of the last layer, shape ``(*, P)``.
-            widening: Factor on each parameter's deviations, shape ``(D,)``.
-            contrast: Power to which they are raised before, in prior deviations, shape ``(D,)``.
-            tails: Logarithm of the ratio of :func:`heavy_tailed`, shape ``(1,)``; ``(0,)`` leaves
-                Gaussian components.
-        """
-        logits, loc, deviation, slope = self.parts(raw)
-        deviation = widening * deviation**contrast
-        if len(tails):
-            logits, deviation = heavy_tailed(logits, deviation, tails.exp())
-            loc, slope = torch.cat([loc, loc], -2), torch.cat([slope, slope], -2)
-        deviation = deviation.clamp(min=FLOOR**0.5)
-        deviation = WIDEST * torch.tanh(deviation / WIDEST)
-        return Mixture(logits, loc, factor(deviation, slope))
-
-    def parts(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return logits ``(*, K)``, means and deviations ``(*, K, D)``, slopes of :func:`factor`.
-
-        The slopes are of shape ``(*, K, D (D - 1) / 2)``, or ``(*, K, 0)`` without correlations;
-        the deviations those before :meth:`widened` bounds them.
-        """
+    def components_of(self, raw: Tensor) -> Components:
+        """Return what :meth:`raw` values ``(*, P)`` mean."""
         logits, loc, diagonal, slope = raw.split(self.sizes, -1)
         each = (*raw.shape[:-1], self.components)
         loc = self.reach * torch.tanh(loc.reshape(*each, self.parameters_) / self.reach)
         deviation = melu(diagonal.reshape(*each, self.parameters_)).sqrt()
         slope = slope.reshape(*each, self.sizes[-1] // self.components)
-        return logits, loc, deviation, STEEPEST * torch.tanh(slope / STEEPEST)
+        return Components(logits, loc, deviation, STEEPEST * torch.tanh(slope / STEEPEST))
+
+
+def widened(components: Components, widening: Tensor, contrast: Tensor, tails: Tensor) -> Mixture:
+    """Return a mixture, wider or narrower than the network said, or of heavier tails.
+
+    Args:
+        components: As the network said.
+        widening: Factor on each parameter's deviations, shape ``(D,)``.
+        contrast: Power to which they are raised before, in prior deviations, shape ``(D,)``.
+        tails: Logarithm of the ratio of :func:`heavy_tailed`, shape ``(1,)``; ``(0,)`` leaves
+            Gaussian components.
+
+    Example:
+        >>> one, none = torch.ones(1), torch.zeros(0)
+        >>> said = Components(one, one[None], one[None], none[None])
+        >>> widened(said, 0.5 * one, one, none).scale_tril.flatten()
+        tensor([0.4974])
+    """
+    logits, loc, deviation, slope = components
+    deviation = widening * deviation**contrast
+    if len(tails):
+        logits, deviation = heavy_tailed(logits, deviation, tails.exp())
+        loc, slope = torch.cat([loc, loc], -2), torch.cat([slope, slope], -2)
+    deviation = deviation.clamp(min=FLOOR**0.5)
+    deviation = WIDEST * torch.tanh(deviation / WIDEST)
+    return Mixture(logits, loc, factor(deviation, slope))
 
 
 def heavy_tailed(logits: Tensor, deviation: Tensor, ratio: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ simulators", arXiv:1906.01728, eq. 9-13). Nothing leaks outside the box and noth
 
 from __future__ import annotations
 
-__all__ = ["TRAINING_POINTS", "MixtureDensityPosterior", "in_training"]
+__all__ = ["TRAINING_POINTS", "MixtureDensityPosterior"]
 
 import warnings
 from functools import partial
@@ -272,16 +272,6 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
     def extra_repr(self) -> str:
         """Show the prior."""
         return repr(self.prior)
-
-
-def in_training(posterior: MixtureDensityPosterior, mixture: Mixture) -> TruncatedGaussianMixture:
-    """Return what a network's mixture stands for while it is fitted: its mass is coarse."""
-    return TruncatedGaussianMixture(
-        *mixture,
-        posterior.prior.box,
-        diagonal=posterior.network.covariance == "diagonal",
-        points=TRAINING_POINTS,
-    )
 
 
 def _distribution(

@@ -42,8 +42,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn.functional import pad
 
-from .posterior import MixtureDensityPosterior, in_training
+from .network import Components, widened
+from .posterior import TRAINING_POINTS, MixtureDensityPosterior
 from .truncation import TruncatedGaussianMixture
 from .weights import effective_sample_size, weights_of
 
@@ -76,9 +78,9 @@ def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase)
     weight, pairs = (weight / weight.sum()).to(z), effective_sample_size(weight)
     with torch.no_grad():
         summary = held_out.get(first.summary_key)
-        raw = [n.network.raw(n.network.scaled(summary)) for n in networks]
-        means = [_log_mean(n, r, weight) for n, r in zip(networks, raw, strict=True)]
-        middle = torch.stack(means).mean(0)
+        said = [n.network.components_of(n.network.raw(n.network.scaled(summary))) for n in networks]
+        middle = torch.stack([_log_mean(own, weight) for own in said]).mean(0)
+        together, nearer = _as_one(said)
     size = len(middle)
     usual = torch.tensor(_usual(size, alone=alone)).to(z)
     near = torch.tensor([_NEAR] * (2 * size) + [_NEAR_TAILS] + [_NEAR_APART] * size).to(z)
@@ -92,14 +94,17 @@ def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase)
     def loss(given: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         with torch.enable_grad():
             values = torch.as_tensor(given).to(z).requires_grad_()
-            mixtures = [
-                n.network.widened(r, *(scale.to(r) for scale in scales(values)))
-                for n, r in zip(networks, raw, strict=True)
-            ]
-            members = [in_training(n, m) for n, m in zip(networks, mixtures, strict=True)]
+            *scaling, shares = *scales(values), values[-size:]
+            moved = together._replace(loc=together.loc + (1 - shares).to(nearer) * nearer)
+            mixture = TruncatedGaussianMixture(
+                *widened(moved, *(scale.to(nearer) for scale in scaling)),
+                first.prior.box,
+                diagonal=not together.slope.shape[-1],
+                points=TRAINING_POINTS,
+            )
             away = (values - usual) / near
             total = away.square().log1p().sum() / pairs
-            total = total - (average(members, values[-size:]).formula(z) * weight).sum()
+            total = total - (mixture.formula(z) * weight).sum()
             (gradient,) = torch.autograd.grad(total, values)
         return total.item(), gradient.double().cpu().numpy().ravel()
 
@@ -140,11 +145,30 @@ def _bounds(size: int, *, alone: bool) -> list[tuple[float, float]]:
     return [*factors, *powers, (0.0, math.log(_HEAVIEST)), *shares]
 
 
-def _log_mean(posterior: MixtureDensityPosterior, raw: Tensor, weight: Tensor) -> Tensor:
+def _log_mean(said: Components, weight: Tensor) -> Tensor:
     """Return the mean logarithm of each parameter's deviations, ``(D,)``."""
-    logits, _, deviation, _ = posterior.network.parts(raw)
-    each = logits.softmax(-1).unsqueeze(-1) * deviation.log()
+    each = said.logits.softmax(-1).unsqueeze(-1) * said.deviation.log()
     return weight @ each.sum(-2).to(weight)
+
+
+def _as_one(said: Sequence[Components]) -> tuple[Components, Tensor]:
+    """Return the components of all networks, and the way from their means to that of all.
+
+    What networks say is the same whatever is done to it: one mixture of all of them is made of it
+    again and again, in a third of the time that one for each takes.
+    """
+    means = torch.stack([_mean(own.logits, own.loc) for own in said])
+    ways = (means.mean(0) - means).unsqueeze(-2)
+    correlated = max(own.slope.shape[-1] for own in said)
+    together = Components(
+        torch.cat([own.logits.log_softmax(-1) for own in said], -1),
+        torch.cat([own.loc for own in said], -2),
+        torch.cat([own.deviation for own in said], -2),
+        torch.cat([pad(own.slope, (0, correlated - own.slope.shape[-1])) for own in said], -2),
+    )
+    return together, torch.cat(
+        [w.expand_as(own.loc) for w, own in zip(ways, said, strict=True)], -2
+    )
 
 
 def average(
@@ -173,7 +197,7 @@ def average(
         return members[0]
     loc = [member.loc for member in members]
     if apart is not None:
-        means = torch.stack([_mean(member) for member in members])
+        means = torch.stack([_mean(member.logits, member.loc) for member in members])
         nearer = (1 - apart.to(means)) * (means.mean(0) - means)
         loc = [own + by.unsqueeze(-2) for own, by in zip(loc, nearer, strict=True)]
     return TruncatedGaussianMixture(
@@ -186,6 +210,6 @@ def average(
     )
 
 
-def _mean(member: TruncatedGaussianMixture) -> Tensor:
-    """Return the mean of the components' means, ``(*, D)``: what a box cuts off is no matter."""
-    return (member.logits.softmax(-1).unsqueeze(-1) * member.loc).sum(-2)
+def _mean(logits: Tensor, loc: Tensor) -> Tensor:
+    """Return the mean of components' means, ``(*, D)``: what a box cuts off is no matter."""
+    return (logits.softmax(-1).unsqueeze(-1) * loc).sum(-2)
