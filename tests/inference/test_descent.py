@@ -65,18 +65,30 @@ def test_overfitting_ends_it_by_itself_but_not_before_the_box():
     traces = descend(nets, pairs(prior, 24), held, epochs=60, **OPTIONS | own)
     mean = [sum(losses) / 2 for losses in zip(*(trace[1] for trace in traces), strict=True)]
     best = mean.index(min(mean))
-    assert len(mean) == max(best + 1, min(best + 1 + 25, 36)) + 7  # the box, then 12 % of 60 epochs
+    # the box, then 12 % of 60 epochs, or half of that: the pairs learned from are far likelier
+    learned = [sum(losses) / 2 for losses in zip(*(trace[0] for trace in traces), strict=True)]
+    assert mean[-1] - learned[-1] > 2 * 0.5
+    assert len(mean) == max(best + 1, min(best + 1 + 25, 36)) + 3
+
+
+def test_a_last_part_in_vain_is_longer_where_nothing_is_overfitted():
+    prior = BoxPrior({"a": (0.0, 1.0), "b": (0.0, 1.0)})
+    held, own = pairs(prior, 200, key=1), {"patience": None}
+    net = MixtureDensityPosterior(prior, 2, components=1)
+    ((learned, losses),) = descend([net], pairs(prior, 400), held, epochs=60, **OPTIONS | own)
+    assert losses[-1] - learned[-1] < 2 * 0.5
+    assert len(losses) == max(losses.index(min(losses)) + 1, 36) + 7
 
 
 def test_without_a_box_it_is_as_patient_until_the_last_part():
     """Nothing to learn, so that the held-out loss wavers: a few epochs in vain are no end."""
     prior = GaussianPrior({"a": (0.0, 1.0)})
-    theta = prior.sample((400,), generator=generator(2))
-    noise = torch.randn(400, 2, generator=generator(3))
-    data = TensorDict({"theta": theta, "summary": noise}, [400])
+    theta = prior.sample((1400,), generator=generator(2))
+    noise = torch.randn(1400, 2, generator=generator(3))
+    data = TensorDict({"theta": theta, "summary": noise}, [1400])
     net = MixtureDensityPosterior(prior, 2, components=1)
     own = {"patience": None, "lr": 3e-2}
-    ((_, losses),) = descend([net], data[:200], data[200:], epochs=40, **OPTIONS | own)
+    ((_, losses),) = descend([net], data[200:], data[:200], epochs=40, **OPTIONS | own)
     best = losses.index(min(losses))
     assert len(losses) == max(best + 1, min(best + 1 + 25, 24)) + 5
     assert best + 6 < 24  # five epochs in vain, long before

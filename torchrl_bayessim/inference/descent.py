@@ -31,6 +31,7 @@ from .weights import weights_of
 _FREE = 0.6  # share of the epochs that do without the box
 _PATIENCE = 25  # epochs without improvement
 _IN_VAIN = 0.12  # at most, as a share of the epochs, in the last part
+_OVERFITTED = 0.5  # nats a parameter by which pairs that were learned from are likelier
 _GATHERED = 64  # minibatches of which the pairs are gathered at once
 
 
@@ -68,8 +69,9 @@ def descend(
         weight_decay: Of AdamW.
         patience: Epochs that do not improve the mean loss of all posteriors, after which the box
             comes in, and then the end; counted anew where the last part begins. None for 25, but
-            in the last part, where the learning rate is low, for no more than 12 % of ``epochs``:
-            what is overfitted by then only gets worse.
+            in the last part, where the learning rate is low, for no more than 12 % of ``epochs``,
+            and half as many where pairs that were learned from are likelier than held-out ones by
+            more than 0.5 nats a parameter: what is overfitted by then only gets worse.
         seeds: Of the minibatches, one for each posterior.
         progress: Whether to show a progress bar.
 
@@ -129,6 +131,7 @@ def _epochs(
     best, least = torch.full((size,), math.inf), math.inf
     boxed, late, stale = first.prior.box is not None, False, 0
     in_vain = patience or min(_PATIENCE, max(1, round(_IN_VAIN * epochs)))
+    sooner = patience or max(1, in_vain // 2)
     patience = patience or _PATIENCE
     trace: list[tuple[Tensor, Tensor]] = []
     bar = tqdm(range(epochs), desc="fit", disable=not progress, leave=False, unit="epoch")
@@ -151,7 +154,9 @@ def _epochs(
             networks.keep(better)
         mean = held_out.mean().item()
         least, stale = (mean, 0) if mean < least - 1e-4 else (least, stale + 1)
-        if (late or not boxed) and stale >= (in_vain if late else patience):
+        overfitted = mean - learned.mean().item() > _OVERFITTED * held.z.shape[-1]
+        limit = patience if not late else sooner if overfitted else in_vain
+        if (late or not boxed) and stale >= limit:
             break
     return trace
 
