@@ -129,7 +129,9 @@ def _as_offered(
     if bendable(train, added):
         return []
     there = {(unit.name, unit.where): unit for unit in laws}
-    others = {unit: there.get((unit.name, unit.where), unit) for unit in added}
+    others = {unit: there[at] for unit in added if (at := (unit.name, unit.where)) in there}
+    if not others:
+        return []
     strengths = model.fit.point.strengths
     moved = {others.get(u, u): others.get(u, u).inside(s) for u, s in strengths.items()}
     return [Point(model.fit.point.z, moved)]

@@ -131,11 +131,12 @@ def without_stopgaps(
         model: To start from.
         offered: Units with effects as they were offered, of which no number has been fitted.
     """
+    anew = partial(with_forms_anew, train, validation, offered=offered)
     while len(model.names) > 1:
         smaller = [
             fitted
             for part in parts(train, validation, model, of=lambda left: bendable(train, left))
-            if (fitted := with_forms_anew(train, validation, part, offered)) is not part
+            if (fitted := anew(part, race=model.fit.cost)) is not part
         ]
         dispersion = model.dispersion()
         cost = partial(priced, train, offered=offered, dispersion=dispersion)

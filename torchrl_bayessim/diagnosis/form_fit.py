@@ -26,10 +26,11 @@ from ..effects.effect import Reach
 from ..effects.units import slides
 from .model import LIKELY, WHITE, Model, criterion, judged, numbers, price
 from .objective import Objective, Point, Unit
-from .refit import Fit, refit, with_prior
+from .refit import Fit, outrun, refit, with_prior
 
 Array = NDArray[np.float64]
 _STEPS = 12  # of Gauss and Newton, at most
+_AFTER = 3  # steps of a fit after each
 _WHITER = 4.0  # times the price of a number, where a model leaves noise alone
 _SHORTER = (0.25, 0.05)  # of a step that leads nowhere better
 _FARTHEST = 10.0  # times the change that shows, in one step: laws are not linear in these numbers
@@ -63,7 +64,12 @@ class _Shift:
 
 
 def with_fitted_forms(
-    train: Objective, validation: Objective, model: Model, offered: Collection[Unit]
+    train: Objective,
+    validation: Objective,
+    model: Model,
+    offered: Collection[Unit],
+    *,
+    race: float = np.inf,
 ) -> Model:
     """Return the model with what its effects have free beside their strengths fitted, too.
 
@@ -78,14 +84,15 @@ def with_fitted_forms(
         validation: Where they are judged.
         model: To start from.
         offered: Units with effects as they were offered, of which no number has been fitted.
+        race: Cost of a rival: what is far behind it and does not catch up is fitted no further.
     """
     sets = train, validation
-    placed = _fitted(sets, model, lambda shift: shift.paid(offered))
+    placed = _fitted(sets, model, lambda shift: shift.paid(offered), race=race)
     count = sum(not shift.paid(offered) for shift in _shifts(train, placed.units))
     if not count:
         return placed
     needed = price(placed) * (_WHITER if placed.mean_square < WHITE else 1.0)
-    return _fitted(sets, placed, needed=LIKELY + count * needed)
+    return _fitted(sets, placed, needed=LIKELY + count * needed, race=race)
 
 
 def bendable(train: Objective, units: Iterable[Unit]) -> bool:
@@ -112,20 +119,27 @@ def _bent(train: Objective, model: Model, offered: Collection[Unit]) -> int:
 
 
 def with_forms_anew(
-    train: Objective, validation: Objective, model: Model, offered: Collection[Unit]
+    train: Objective,
+    validation: Objective,
+    model: Model,
+    offered: Collection[Unit],
+    *,
+    race: float = np.inf,
 ) -> Model:
     """Return the model with what is free fitted again, once another effect has been taken out.
 
     What was bent to make up for that effect is straight again where it need not be bent: laws are
     fitted from how they were offered, too, and stay that way unless the bent ones explain more.
+    Arguments are those of `with_fitted_forms`.
     """
-    sets, bent = (train, validation), with_fitted_forms(train, validation, model, offered)
+    sets = train, validation
+    bent = with_fitted_forms(*sets, model, offered, race=race)
     shifts = [s for s in _shifts(train, model.units) if s.paid(offered) and not s.placed]
     if not shifts:
         return bent
     changes = [_nearest_offered(shift, offered) - _value(shift) for shift in shifts]
     (straight,) = judged(*sets, refit(train, [_with(model.fit.point, shifts, changes)]))
-    straight = with_fitted_forms(*sets, straight, offered)
+    straight = with_fitted_forms(*sets, straight, offered, race=race)
     return straight if straight.fit.cost < bent.fit.cost + price(model) else bent
 
 
@@ -153,6 +167,7 @@ def _fitted(
     moves: Callable[[_Shift], bool] = lambda _: True,
     *,
     needed: float = LIKELY,
+    race: float = np.inf,
 ) -> Model:
     """Return the model with what is free fitted, or itself where that gains too little.
 
@@ -161,6 +176,7 @@ def _fitted(
         model: To start from.
         moves: Which numbers are fitted.
         needed: Deviance to gain.
+        race: Cost of a rival.
     """
     train, best = sets[0], model
     for _ in range(_STEPS):
@@ -168,16 +184,33 @@ def _fitted(
         if not shifts:
             break
         whole, *shorter = _moved(train, best, shifts)
-        fitted = refit(train, [whole], iterations=2)[0]
+        fitted = _refitted(train, best.fit, [whole])
         if fitted.cost >= best.fit.cost:
-            fitted = min(refit(train, shorter, iterations=2), key=lambda fit: fit.cost)
+            fitted = _refitted(train, best.fit, shorter)
         gained = best.fit.cost - fitted.cost
         if gained <= 0:
             break
         (best,) = judged(*sets, [fitted])
-        if gained < LIKELY:
+        if gained < LIKELY * max(1.0, best.mean_square) or outrun(best.fit.cost, gained, race):
             break
-    return best if model.fit.cost - best.fit.cost > needed else model
+    if model.fit.cost - best.fit.cost <= needed:
+        return model
+    return judged(*sets, refit(train, [best.fit.point], iterations=0))[0]
+
+
+def _refitted(train: Objective, known: Fit, starts: Sequence[Point]) -> Fit:
+    """Return the best of fits from starts near a known one, whose derivatives they begin with."""
+    origins = [replace(known, point=p, units=tuple(p.strengths)) for p in _as_before(known, starts)]
+    return min(refit(train, starts, origins=origins, iterations=_AFTER), key=lambda f: f.cost)
+
+
+def _as_before(known: Fit, starts: Sequence[Point]) -> list[Point]:
+    """Return where a fit is, in units of the laws that it will have."""
+    before = known.point
+    return [
+        Point(before.z, dict(zip(start.strengths, before.strengths.values(), strict=True)))
+        for start in starts
+    ]
 
 
 def _shifts(train: Objective, units: Iterable[Unit]) -> list[_Shift]:

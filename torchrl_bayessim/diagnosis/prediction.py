@@ -115,11 +115,16 @@ class Predictor:
         colliding = (model.geom_contype | model.geom_conaffinity).any()
         return bool(colliding or model.npair or model.nflex)
 
-    def exactly(self) -> None:
-        """From now on take the task's own time steps, and let forces follow the state at each."""
+    def exactly(self, substeps: int | None = None) -> None:
+        """From now on let forces follow the state at each time step.
+
+        Args:
+            substeps: Time steps per control step from now on; default the task's.
+        """
         self.exact = True
-        if self.substeps != self.system.task.frame_skip:
-            self._divide(self.system.task.frame_skip)
+        substeps = substeps or self.system.task.frame_skip
+        if self.substeps != substeps:
+            self._divide(substeps)
             self.__dict__.pop("finer", None)
 
     def divided(self, substeps: int) -> Predictor:

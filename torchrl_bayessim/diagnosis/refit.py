@@ -6,7 +6,7 @@ finite differences, which effects such as a delay or a dead band also have.
 
 from __future__ import annotations
 
-__all__ = ["WIDE", "Fit", "refit", "with_prior", "with_width"]
+__all__ = ["WIDE", "Fit", "outrun", "refit", "with_prior", "with_width"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -169,7 +169,9 @@ def refit(
             if vectors:
                 descent.tell([next(residuals) for _ in vectors])
         if race is not None:
-            _outrun(descents, min(race, *(descent.cost for descent in descents)))
+            ahead = min(race, *(descent.cost for descent in descents))
+            for descent in descents:
+                descent.done = descent.done or outrun(descent.cost, descent.gain, ahead)
     return [
         Fit(_point(d.vector, units, objective.size), units, d.residual, d.jacobian)
         for d, units in zip(descents, models, strict=True)
@@ -205,12 +207,10 @@ def with_width(objective: Objective, point: Point) -> Objective:
     return objective.differing(WIDE) if rough else objective
 
 
-def _outrun(descents: Sequence[LevenbergMarquardt], ahead: float) -> None:
-    """Stop the descents of which steps like the last would not bring them near a cost."""
-    for descent in descents:
-        behind = descent.cost - (_BEHIND * ahead + _CHANCE)
-        if behind > 0 and descent.gain < _CATCHING_UP * behind:
-            descent.done = True
+def outrun(cost: float, gain: float, ahead: float) -> bool:
+    """Return whether steps like the last would not bring a fit near a cost that is ahead of it."""
+    behind = cost - (_BEHIND * ahead + _CHANCE)
+    return behind > 0 and gain < _CATCHING_UP * behind
 
 
 def _origin(fit: Fit, units: tuple[Unit, ...]) -> tuple[Array, Array, Array]:

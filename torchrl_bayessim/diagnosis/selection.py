@@ -17,6 +17,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .alternatives import alternatives, exchanged, stands_in
 from .choice import chosen, fewest
@@ -31,8 +32,9 @@ from .screening import Screen
 from .shapes import with_shapes
 from .wavering import waver
 
+Array = NDArray[np.float64]
 _MOST = 4  # effects in one explanation
-_UNSEEN = 1.0  # a deviance that no test can detect
+_UNSEEN = 1.0  # a deviance, in units of the dispersion, that no test can detect
 _AGAIN = 3  # steps of fits whose noise was another
 _EXCHANGES = 3  # of effects for others in their places
 
@@ -265,20 +267,29 @@ def _beside(model: Model, found: Sequence[Unit]) -> list[Unit]:
 
 
 def _exactly(train: Objective, validation: Objective, model: Model) -> Model:
-    """Fit a model with the simulator's own time steps and forces that follow the state at each.
+    """Fit a model with forces that follow the state at each time step, as many as can be told.
 
-    Where that can be seen: forces that are held for 10 ms lag, and what lags looks like a delay to
-    the next round.
+    Forces that are held for 10 ms lag, and what lags looks like a delay to the next round. Where
+    something is missing still, less of it can be told: deviances count by their dispersion.
     """
-    if train.predictor.exact:
+    own = train.predictor.system.task.frame_skip
+    if train.predictor.exact and train.predictor.substeps == own:
         return model
-    exact = train.predictor.divided(train.predictor.system.task.frame_skip)
-    exact.exactly()
-    there = train.on(exact)([model.fit.point])[0]
-    if float(((there - model.fit.innovations) ** 2).sum()) < _UNSEEN:
+    tolerated = _UNSEEN * max(1.0, model.fit.mean_square)
+
+    def exact(substeps: int) -> Array:
+        other = train.predictor.divided(substeps)
+        other.exactly(substeps)
+        return train.on(other)([model.fit.point])[0]
+
+    true = exact(own)
+    if float(((true - model.fit.innovations) ** 2).sum()) < tolerated:
         return model
+    fewer = (n for n in range(train.predictor.substeps, own) if own % n == 0)
+    near = (n for n in fewer if float(((true - exact(n)) ** 2).sum()) < tolerated)
+    substeps = next(near, own)
     for predictor in {train.predictor, validation.predictor}:
-        predictor.exactly()
+        predictor.exactly(substeps)
     return judged(train, validation, refit(train, [model.fit.point], iterations=4))[0]
 
 
