@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -271,6 +272,7 @@ def amortised(
             )
     made["Rejection ABC"] = lambda: (rejection_abc(prior, theta, x), None)
     if settings.npe and not settings.paper_mode:
+        import_module("sbi.inference")  # seconds that are no part of a fit
         for kind in ("mdn", "maf", "nsf"):
             made[f"NPE {kind.upper()} (sbi)"] = lambda kind=kind: (
                 npe(prior, theta, x, kind=kind, seed=seed),

@@ -104,6 +104,22 @@ def test_a_small_bias_of_every_trajectory_is_found_in_their_mean(network):
     assert trust(network, off, simulate=simulate).predictive < 0.01
 
 
+@pytest.mark.parametrize("masses", [[0.1, 0.9], [0.3, 0.7] * 5, [0.5] * 9 + [0.9]])
+def test_trajectories_that_contradict_each_other_are_doubted(network, masses):
+    """Each may be, and so may their mean; no one robot makes both."""
+    theta = torch.tensor([[mass, 0.5] for mass in masses])
+    found = trust(network, simulate(theta, "contradiction"), simulate=simulate)
+    assert found.predictive <= 0.01
+    expected = f"as far out as the real {len(masses)} summaries together"
+    assert any(expected in text for text in found.doubts)
+
+
+def test_simulations_that_all_diverge_are_said_to(network):
+    found = trust(network, torch.tensor([0.4, 0.8]), simulate=lambda theta: theta * torch.nan)
+    assert found.predictive == 0.0
+    assert "all 200 simulations at the posterior diverged" in str(found)
+
+
 @pytest.mark.parametrize("count", [2, pytest.param(20, marks=pytest.mark.slow)])
 def test_right_trajectories_are_a_surprise_as_rarely_as_was_promised(network, count):
     alarms = 0

@@ -8,7 +8,8 @@ needs the simulator:
 * is the network calibrated on pairs that it was not trained on (:mod:`.calibration`);
 * what do the data say about each parameter (:mod:`.identifiability`);
 * would simulations at the posterior give the real summary: the share of them that lies at least as
-  far from the others as the real one does; of n trajectories, the share of means of n.
+  far from the others as the real one does; of n trajectories, the share of groups of n, by their
+  means and by how far they lie apart.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from .posterior import MixtureDensityPosterior
 from .priors import Prior
 
 _FEWEST = 50  # pairs, below which shares say too little
+_ALIKE = 20  # simulations of which the parameters are nearly the same
 _SURPRISE = 0.01  # share below which the real data are a surprise to the posterior
 
 
@@ -50,8 +52,8 @@ class Trust:
         identifiability: What the data say about each parameter.
         calibration: Of answers for one trajectory, on held-out pairs; ``None`` without at least 50.
         predictive: Share of simulations at the posterior that lie at least as far out as the real
-            summary, or of means of n of them as far as the mean of n real ones; ``None`` without a
-            simulator.
+            summary, or of n of them as far as n real ones, by their means and by how much farther
+            than usual they lie apart; 0 if all diverged, ``None`` without a simulator.
     """
 
     posterior: PhysicsPosterior
@@ -130,11 +132,18 @@ def trust(
     if simulate is None:
         return told
     theta = draw(posterior, simulations, key=(seed, "predictive"))
-    predictive = _share_as_far(_predicted(simulate, theta, rows), rows, seed=seed)
+    predicted = _predicted(simulate, theta, rows)
+    finite = predicted.isfinite().all(-1)
+    theta, predicted = theta[finite], predicted[finite]
+    if not len(predicted):
+        surprise = f"all {simulations} simulations at the posterior diverged: the robot did not."
+        return replace(told, doubts=(*told.doubts, surprise), predictive=0.0)
+    predictive = _share_as_far(theta, predicted, rows, seed=seed)
     if predictive <= _SURPRISE:
+        real = "summary" if len(rows) == 1 else f"{len(rows)} summaries together"
         surprise = (
             f"only {predictive:.1%} of {simulations} simulations at the posterior lie as far "
-            "out as the real summary: they do not reproduce the data."
+            f"out as the real {real}: they do not reproduce the data."
         )
         told = replace(told, doubts=(*told.doubts, surprise))
     return replace(told, predictive=predictive)
@@ -177,22 +186,28 @@ def _predicted(simulate: Callable[[Tensor], Tensor], theta: Tensor, rows: Tensor
     return predicted.to(rows)
 
 
-def _share_as_far(predicted: Tensor, rows: Tensor, *, seed: int) -> float:
-    """Return how many simulations lie as far out as real rows do, by their means.
+def _share_as_far(theta: Tensor, predicted: Tensor, rows: Tensor, *, seed: int) -> float:
+    """Return how many simulations lie as far out as real rows do, by their means and spreads.
 
     A product of n answers is as sure as n times as many data: the rows one by one may all be likely
-    where their mean is not. Means are of n simulations drawn at random (a bootstrap), and vary as
-    well by what the mean of so few simulations may be off.
+    where their mean is not, or where no parameter makes them differ so much. Means and spreads are
+    of n simulations drawn at random (a bootstrap) from those of nearly the same parameters; means
+    vary as well by what the mean of so few simulations may be off. A spread that is smaller than
+    usual is no reason to doubt: parameters are not quite the same in a group.
     """
-    predicted = predicted[predicted.isfinite().all(-1)]
-    count = len(predicted)
-    if len(rows) > 1 and count:
-        g = generator(seed, "groups")
-        some = lambda size: predicted[torch.randint(count, (size,), generator=g)].mean(0)
-        mean = predicted.mean(0)
-        means = [some(len(rows)) + some(count) - mean for _ in range(count)]
-        predicted = torch.stack(means)
-    return strangeness(predicted, rows.mean(0))[0]
+    if len(rows) < 2:
+        return strangeness(predicted, rows[0])[0]
+    g, count = generator(seed, "groups"), len(predicted)
+    u = theta / theta.std(0, correction=0).clamp_min(1e-12)
+    alike = torch.cdist(u, u).topk(min(_ALIKE, count), largest=False).indices
+    some = lambda of, size: predicted[of[torch.randint(len(of), (size,), generator=g)]]
+    every = torch.arange(count)
+    off = torch.stack([some(every, count).mean(0) for _ in every]) - predicted.mean(0)
+    groups = torch.stack([some(near, len(rows)) for near in alike])
+    usual = groups.std(1).median(0).values
+    by_groups = torch.cat([groups.mean(1) + off, torch.maximum(groups.std(1), usual)], -1)
+    real = torch.cat([rows.mean(0), torch.maximum(rows.std(0), usual)])
+    return strangeness(by_groups, real)[0]
 
 
 def _unweighted(pairs: TensorDictBase | None) -> TensorDictBase | None:
