@@ -4,7 +4,7 @@ from __future__ import annotations
 
 __all__ = ["chosen", "fewest"]
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from .form_fit import bendable, fitted_numbers, priced, with_fitted_forms
 from .model import WHITE, Model, as_good, best_by_effect, criterion, gain, judged, needed, shown
@@ -59,7 +59,7 @@ def fewest(
     """
     singles = [m for m in models if len(_new_names(base, m)) == 1]
     if better is None:  # a law in a wrong form may fit some runs and predict no others
-        bent = _in_other_forms(sets, base, singles, offered)
+        bent = _worth_bending(sets, base, _in_other_forms(sets, base, singles, offered), offered)
         least = priced(sets[0], base, offered)
         return next((m for m in bent if priced(sets[0], m, offered) < least), None)
     several, smaller = len(_new_names(base, better)) > 1, None
@@ -74,11 +74,12 @@ def fewest(
             return smaller if white else with_fitted_forms(*sets, smaller, offered)
     elif better.mean_square < WHITE:
         return better
-    fitted = _in_other_forms(sets, base, singles, offered)
+    tried = _in_other_forms(sets, base, singles, offered)
+    fitted = _worth_bending(sets, base, tried, offered)
     if several:
         better = next((m for m in fitted if as_good(better, m)), better)
         return smaller if smaller is not None and not worth(base, better, models) else better
-    own = with_fitted_forms(*sets, better, offered)
+    own = tried.get(better) or with_fitted_forms(*sets, better, offered)
     return min([own, *fitted], key=lambda m: priced(sets[0], m, offered))
 
 
@@ -102,11 +103,11 @@ def _in_other_forms(
     base: Model,
     singles: Sequence[Model],
     offered: Sequence[Unit],
-) -> list[Model]:
-    """Return the best few models of one new effect whose law bends to the data, the best first.
+) -> dict[Model, Model]:
+    """Return the best few models of one new effect as they are, and with laws bent to the data.
 
-    Whose law, or that of what is there already: what was bent to make up for the new effect is in
-    its way.
+    Its law, or that of what is there already: what was bent to make up for the new effect is in its
+    way.
     """
     train = sets[0]
     kinds = best_by_effect(singles, base)
@@ -116,7 +117,16 @@ def _in_other_forms(
     plain = plain[:_FORMS]
     softer = [point for m in plain for point in _as_offered(train, m, m.beyond(base), laws)]
     plain += judged(*sets, refit(train, softer, iterations=4)) if softer else []
-    tried = {m: with_fitted_forms(*sets, m, offered) for m in plain}
+    return {m: with_fitted_forms(*sets, m, offered) for m in plain}
+
+
+def _worth_bending(
+    sets: tuple[Objective, Objective],
+    base: Model,
+    tried: Mapping[Model, Model],
+    offered: Sequence[Unit],
+) -> list[Model]:
+    """Return those that gain by their bent laws, and that explain what no fit saw, best first."""
     fitted = [bent for plain, bent in tried.items() if bent is not plain]
     fitted = [bent for bent in fitted if gain(base, bent) > needed(base, bent)]
     return sorted(fitted, key=lambda m: priced(sets[0], m, offered))
