@@ -1,9 +1,12 @@
+import math
+
 import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_bayessim.inference.calibration import calibrate, calibrate_draws
+from torchrl_bayessim.inference.calibration import calibrate, calibrate_draws, calibrate_pooled
 from torchrl_bayessim.inference.fit import fit
+from torchrl_bayessim.inference.network import WIDEST
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
 from torchrl_bayessim.randomness import generator
@@ -201,3 +204,32 @@ def test_draws_of_another_shape_are_refused():
             torch.zeros(5, 3, 2),
             log_prob=(torch.zeros(4), torch.zeros(5, 4)),
         )
+
+
+def that_says(deviation):
+    """Return a network that answers N(0, deviation^2) to every summary, under a prior N(0, 1)."""
+    network = MixtureDensityPosterior(GaussianPrior({"a": (0.0, 1.0)}), 1, components=1)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.zero_()
+        free = WIDEST * math.atanh(deviation / WIDEST)
+        network.network.head.bias[2] = 2 * math.log(free) if free < 1 else free**2 - 1
+    return network
+
+
+def test_a_product_of_answers_may_be_too_sure_where_each_is_not():
+    theta = torch.randn(60, 1, generator=generator("truths"))
+    nothing = torch.zeros(60, 20, 1)
+    assert calibrate_pooled(that_says(1.0), theta, nothing).passed
+    pairs = TensorDict({"theta": theta, "summary": nothing[:, 0]}, [60])
+    assert calibrate(that_says(0.9), pairs).passed
+    pooled = calibrate_pooled(that_says(0.9), theta, nothing)
+    # of twenty answers the variance is 1 / (1 + 20 (1 / 0.81 - 1))
+    assert pooled.coverage(0.9)["joint"] == pytest.approx(0.51, abs=0.13)
+    assert not pooled.passed
+    assert "the answer is too sure: of 60 known" in pooled.doubts(what="the answer")[0]
+
+
+def test_groups_of_another_number_are_refused():
+    with pytest.raises(ValueError, match=r"shape \(N, n, L\) for truths of shape \(3, 1\), got"):
+        calibrate_pooled(that_says(1.0), torch.zeros(3, 1), torch.zeros(2, 4, 1))

@@ -104,6 +104,22 @@ def test_a_small_bias_of_every_trajectory_is_found_in_their_mean(network):
     assert trust(network, off, simulate=simulate).predictive < 0.01
 
 
+def test_a_product_that_is_too_sure_is_doubted_where_single_answers_are_not(network):
+    """Runs that are the same say no more than one does, and the network thinks that they do."""
+
+    def once(theta):
+        few = simulate(theta[::4], "runs of one robot")
+        return few.repeat_interleave(4, 0)[: len(theta)]
+
+    real = once(torch.tensor([[0.4, 0.5]]).expand(4, 2))
+    found = trust(network, real, simulate=once, truths=50)
+    assert found.calibration.passed
+    assert not found.pooled.passed
+    assert any("answer for 4 trajectories together is too sure" in text for text in found.doubts)
+    alone = trust(network, real)
+    assert "Not checked: calibration of 4 together, without simulate and truths." in str(alone)
+
+
 @pytest.mark.parametrize("masses", [[0.1, 0.9], [0.3, 0.7] * 5, [0.5] * 9 + [0.9]])
 def test_trajectories_that_contradict_each_other_are_doubted(network, masses):
     """Each may be, and so may their mean; no one robot makes both."""

@@ -19,7 +19,7 @@ the data and returns the prior passes, since nothing here sees the data: nats st
 
 from __future__ import annotations
 
-__all__ = ["Calibration", "calibrate", "calibrate_draws", "coverage_band"]
+__all__ = ["Calibration", "calibrate", "calibrate_draws", "calibrate_pooled", "coverage_band"]
 
 from dataclasses import dataclass
 from typing import Any
@@ -79,15 +79,15 @@ class Calibration:
         p = self.p_values()
         return min(p.values()) > _LEVEL / len(p)
 
-    def doubts(self) -> list[str]:
-        """Return one sentence if the test fails, none otherwise."""
+    def doubts(self, *, what: str = "the posterior") -> list[str]:
+        """Return one sentence, on ``what``, if the test fails, none otherwise."""
         if self.passed:
             return []
         inner, outer = (self.coverage(level) for level in (0.5, 0.9))
         worst = min(self.p_values().items(), key=lambda item: item[1])
         sure = "too sure" if outer["joint"] < 0.9 else "not sure enough, or biased"
         return [
-            f"the posterior is {sure}: of {len(self.rank)} known truths its 50 % and 90 % regions "
+            f"{what} is {sure}: of {len(self.rank)} known truths its 50 % and 90 % regions "
             f"hold {inner['joint']:.0%} and {outer['joint']:.0%} ({worst[0]}: p = {worst[1]:.1g}). "
             "Try more simulations, or the average of several networks."
         ]
@@ -226,6 +226,53 @@ def calibrate(
         drawn,
         log_prob=(at_truth, at_draws),
         seed=seed,
+    )
+
+
+@torch.no_grad()
+def calibrate_pooled(
+    posterior: MixtureDensityPosterior | AveragedPosterior,
+    theta: Tensor,
+    summaries: Tensor,
+    *,
+    draws: int = 300,
+    seed: int = 0,
+) -> Calibration:
+    """Return the calibration of answers for n trajectories together.
+
+    What is a little off in each of n answers is n times as much in their product: one that is right
+    for single trajectories may be too sure of many.
+
+    Args:
+        posterior: The network, or the average of several.
+        theta: Truths from the prior, shape ``(N, D)``.
+        summaries: Of n trajectories of each, shape ``(N, n, L)``.
+        draws: Posterior draws for each truth.
+        seed: Same seed, same numbers.
+
+    Raises:
+        ValueError: There are not as many truths as groups of summaries.
+
+    Example:
+        >>> from torchrl_bayessim.inference.priors import BoxPrior
+        >>> prior = BoxPrior({"mass": (2.0, 6.0)})
+        >>> untrained = MixtureDensityPosterior(prior, 2, components=1)
+        >>> found = calibrate_pooled(untrained, prior.sample((60,)), torch.zeros(60, 4, 2))
+        >>> sorted(found.coverage(0.5))
+        ['joint', 'mass']
+    """
+    if summaries.ndim != 3 or len(summaries) != len(theta) or not len(theta):
+        expected = f"summaries of shape (N, n, L) for truths of shape {tuple(theta.shape)}"
+        raise ValueError(message(expected, tuple(summaries.shape)))
+    found = []
+    for index, (own, rows) in enumerate(zip(theta, summaries, strict=True)):
+        q = posterior.condition(rows, check=False)
+        some = q.sample((draws,), generator=generator(seed, "pooled calibration", index))
+        found.append((some, q.log_prob(own), q.log_prob(some)))
+    drawn, at_truth, at_draws = (torch.stack(part, -1) for part in zip(*found, strict=True))
+    log_prob = at_truth, at_draws
+    return calibrate_draws(
+        posterior.prior.names, theta, drawn.movedim(-1, 1), log_prob=log_prob, seed=seed
     )
 
 

@@ -5,7 +5,8 @@ needs the simulator:
 
 * does the real summary lie apart from all simulated ones, or the posterior at an edge
   (:mod:`.misspecification`);
-* is the network calibrated on pairs that it was not trained on (:mod:`.calibration`);
+* is the network calibrated on pairs that it was not trained on (:mod:`.calibration`), and, which
+  takes the simulator, its answer for as many trajectories together as there are;
 * what do the data say about each parameter (:mod:`.identifiability`);
 * would simulations at the posterior give the real summary: the share of them that lies at least as
   far from the others as the real one does; of n trajectories, the share of groups of n, by their
@@ -29,7 +30,7 @@ from ..kinds import check_function, check_kind
 from ..randomness import generator
 from ..sources import draw
 from .averaged_posterior import AveragedPosterior
-from .calibration import Calibration, calibrate
+from .calibration import Calibration, calibrate, calibrate_pooled
 from .ensemble import real_summaries
 from .identifiability import Identifiability, identifiability
 from .misspecification import doubts, strangeness
@@ -54,6 +55,9 @@ class Trust:
         predictive: Share of simulations at the posterior that lie at least as far out as the real
             summary, or of n of them as far as n real ones, by their means and by how much farther
             than usual they lie apart; 0 if all diverged, ``None`` without a simulator.
+        pooled: Calibration of answers for n trajectories together, at parameters of the prior;
+            ``None`` for one trajectory, or without a simulator and ``truths``.
+        trajectories: How many real ones there are.
     """
 
     posterior: PhysicsPosterior
@@ -61,6 +65,8 @@ class Trust:
     identifiability: Identifiability
     calibration: Calibration | None
     predictive: float | None
+    pooled: Calibration | None = None
+    trajectories: int = 1
 
     @property
     def unchecked(self) -> tuple[str, ...]:
@@ -68,6 +74,10 @@ class Trust:
         found = []
         if self.calibration is None:
             found.append(f"calibration, without {_FEWEST} held-out pairs of equal weight")
+        if self.trajectories > 1 and self.pooled is None:
+            found.append(
+                f"calibration of {self.trajectories} together, without simulate and truths"
+            )
         if self.predictive is None:
             found.append("whether simulations at the posterior give such data, without simulate")
         return tuple(found)
@@ -86,6 +96,7 @@ def trust(
     held_out: TensorDictBase | None = None,
     simulate: Callable[[Tensor], Tensor] | None = None,
     simulations: int = 200,
+    truths: int = 0,
     seed: int = 0,
 ) -> Trust:
     """Condition a fitted network, or several, on real summaries, and report on the result.
@@ -98,6 +109,8 @@ def trust(
             its width, which flatter it; none if the fit had weights.
         simulate: Parameters ``(N, D)`` to summaries ``(N, L)``, for the posterior predictive check.
         simulations: Of that check, at least 99.
+        truths: Known parameters at which the answer for n trajectories is checked, at least 50,
+            with n simulations each; 0 for none. A hundred of ten take half a minute to condition.
         seed: Same seed, same report.
 
     Raises:
@@ -125,12 +138,17 @@ def trust(
         check_kind("held-out pairs in a TensorDict", held_out, TensorDictBase)
     if network.seen is None:
         raise ValueError(message("a fitted network", "one that is not", hint="fit(network, pairs)"))
+    if truths != 0:
+        check_count("truths", truths, least=_FEWEST)
     rows = torch.atleast_2d(real_summaries(observed))
     posterior = network.condition(rows, check=False)
     found = doubts(network.seen, rows, posterior)
     told = reported(network, posterior, found, prior=prior, held_out=held_out, seed=seed)
+    told = replace(told, trajectories=len(rows))
     if simulate is None:
         return told
+    if len(rows) > 1 and truths:
+        told = _with_pooled(told, network, simulate, rows, truths=truths, seed=seed)
     theta = draw(posterior, simulations, key=(seed, "predictive"))
     predicted = _predicted(simulate, theta, rows)
     finite = predicted.isfinite().all(-1)
@@ -175,6 +193,27 @@ def reported(
         found = [*found, *calibration.doubts()]
     told = identifiability(posterior, prior=prior)
     return Trust(posterior, tuple(found), told, calibration, predictive=None)
+
+
+def _with_pooled(
+    told: Trust,
+    network: MixtureDensityPosterior | AveragedPosterior,
+    simulate: Callable[[Tensor], Tensor],
+    rows: Tensor,
+    *,
+    truths: int,
+    seed: int,
+) -> Trust:
+    """Return the report with the calibration of answers for as many rows together."""
+    theta = draw(network.prior, truths, key=(seed, "truths"))
+    count = len(rows)
+    groups = _predicted(simulate, theta.repeat_interleave(count, 0), rows).unflatten(0, (-1, count))
+    whole = groups.isfinite().flatten(1).all(-1)
+    if whole.sum() < _FEWEST:
+        return told
+    pooled = calibrate_pooled(network, theta[whole], groups[whole], seed=seed)
+    doubts = pooled.doubts(what=f"the answer for {count} trajectories together")
+    return replace(told, pooled=pooled, doubts=(*told.doubts, *doubts))
 
 
 def _predicted(simulate: Callable[[Tensor], Tensor], theta: Tensor, rows: Tensor) -> Tensor:
