@@ -195,22 +195,17 @@ def _fitted(
             break
     if model.fit.cost - best.fit.cost <= needed:
         return model
-    return judged(*sets, refit(train, [best.fit.point], iterations=0))[0]
+    return replace(best, fit=refit(train, [best.fit.point], iterations=0)[0])
 
 
 def _refitted(train: Objective, known: Fit, starts: Sequence[Point]) -> Fit:
     """Return the best of fits from starts near a known one, whose derivatives they begin with."""
-    origins = [replace(known, point=p, units=tuple(p.strengths)) for p in _as_before(known, starts)]
+    origins = []
+    for start in starts:  # the known one in units of the laws that there are now
+        strengths = dict(zip(start.strengths, known.point.strengths.values(), strict=True))
+        before = Point(known.point.z, strengths)
+        origins.append(replace(known, point=before, units=tuple(strengths)))
     return min(refit(train, starts, origins=origins, iterations=_AFTER), key=lambda f: f.cost)
-
-
-def _as_before(known: Fit, starts: Sequence[Point]) -> list[Point]:
-    """Return where a fit is, in units of the laws that it will have."""
-    before = known.point
-    return [
-        Point(before.z, dict(zip(start.strengths, before.strengths.values(), strict=True)))
-        for start in starts
-    ]
 
 
 def _shifts(train: Objective, units: Iterable[Unit]) -> list[_Shift]:

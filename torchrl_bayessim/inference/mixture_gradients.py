@@ -90,17 +90,11 @@ def log_density_and_pullback(
 
     def pullback(upstream: Tensor) -> Tensor:
         times = upstream.double().cpu().numpy().reshape(-1)
-        by_raw = np.empty_like(values)
         with np.errstate(all="ignore"):
-            np.multiply(times, share - weight, out=by_raw[: network.components])
-            row = network.components
+            by_raw = [times * (share - weight)]
             for by_part, derivative in zip(pull(times * share), chain, strict=True):
-                rows = derivative.shape[0] * derivative.shape[1]
-                np.multiply(
-                    by_part, derivative, out=by_raw[row : row + rows].reshape(by_part.shape)
-                )
-                row += rows
-        return torch.as_tensor(by_raw.T.reshape(raw.shape), device=raw.device)
+                by_raw.append((by_part * derivative).reshape(-1, values.shape[1]))
+        return torch.as_tensor(np.concatenate(by_raw).T.reshape(raw.shape), device=raw.device)
 
     found = torch.as_tensor((log_q - log_total).reshape(raw.shape[:-1]), device=raw.device)
     return found, pullback

@@ -157,8 +157,7 @@ def _as_one(said: Sequence[Components]) -> tuple[Components, Tensor]:
     What networks say is the same whatever is done to it: one mixture of all of them is made of it
     again and again, in a third of the time that one for each takes.
     """
-    means = torch.stack([_mean(own.logits, own.loc) for own in said])
-    ways = (means.mean(0) - means).unsqueeze(-2)
+    ways = _ways(said)
     correlated = max(own.slope.shape[-1] for own in said)
     together = Components(
         torch.cat([own.logits.log_softmax(-1) for own in said], -1),
@@ -197,9 +196,9 @@ def average(
         return members[0]
     loc = [member.loc for member in members]
     if apart is not None:
-        means = torch.stack([_mean(member.logits, member.loc) for member in members])
-        nearer = (1 - apart.to(means)) * (means.mean(0) - means)
-        loc = [own + by.unsqueeze(-2) for own, by in zip(loc, nearer, strict=True)]
+        ways = _ways(members)
+        nearer = (1 - apart.to(ways)) * ways
+        loc = [own + by for own, by in zip(loc, nearer, strict=True)]
     return TruncatedGaussianMixture(
         torch.cat([member.logits for member in members], -1),
         torch.cat(loc, -2),
@@ -210,6 +209,11 @@ def average(
     )
 
 
-def _mean(logits: Tensor, loc: Tensor) -> Tensor:
-    """Return the mean of components' means, ``(*, D)``: what a box cuts off is no matter."""
-    return (logits.softmax(-1).unsqueeze(-1) * loc).sum(-2)
+def _ways(members: Sequence[Components] | Sequence[TruncatedGaussianMixture]) -> Tensor:
+    """Return the way from each member's mean to the mean of all, ``(M, *, 1, D)``.
+
+    Means of components' means: what a box cuts off is no matter.
+    """
+    each = [(member.logits.softmax(-1).unsqueeze(-1) * member.loc).sum(-2) for member in members]
+    means = torch.stack(each)
+    return (means.mean(0) - means).unsqueeze(-2)
