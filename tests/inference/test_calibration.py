@@ -217,12 +217,16 @@ def that_says(deviation):
     return network
 
 
-def test_a_product_of_answers_may_be_too_sure_where_each_is_not():
+def test_a_product_of_answers_may_be_too_sure_where_each_is_not(monkeypatch):
     theta = torch.randn(60, 1, generator=generator("truths"))
     nothing = torch.zeros(60, 20, 1)
     assert calibrate_pooled(that_says(1.0), theta, nothing).passed
     pairs = TensorDict({"theta": theta, "summary": nothing[:, 0]}, [60])
     assert calibrate(that_says(0.9), pairs).passed
+    # answers that are all the same are not taken for twenty
+    assert calibrate_pooled(that_says(0.9), theta, nothing).passed
+    independent = lambda *_, **__: torch.zeros(1)
+    monkeypatch.setattr("torchrl_bayessim.inference.posterior.shared_by_rows", independent)
     pooled = calibrate_pooled(that_says(0.9), theta, nothing)
     # of twenty answers the variance is 1 / (1 + 20 (1 / 0.81 - 1))
     assert pooled.coverage(0.9)["joint"] == pytest.approx(0.51, abs=0.13)

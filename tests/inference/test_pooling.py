@@ -137,10 +137,12 @@ def test_conditioning_does_not_depend_on_the_order(prior, pooling):
 
 def test_more_trajectories_sharpen_a_conditioned_posterior():
     posterior = MixtureDensityPosterior(BoxPrior({"a": (0.0, 1.0)}), 3, components=1)
-    with torch.no_grad():  # a narrow posterior in the middle, whatever the summary
-        posterior.network.head.weight.zero_()
+    with torch.no_grad():  # a narrow posterior near the middle, wherever the summary moves it
+        posterior.network.head.weight[[0, 2]] = 0.0
+        posterior.network.head.weight[1] *= 20
         posterior.network.head.bias.copy_(torch.tensor([0.0, 0.0, -4.0]))
-    deviation = [posterior.condition(torch.zeros(n, 3)).stddev.item() for n in (1, 4, 16)]
+    rows = torch.randn(16, 3, generator=generator("scattered"))
+    deviation = [posterior.condition(rows[:n]).stddev.item() for n in (1, 4, 16)]
     assert deviation[0] / deviation[1] == pytest.approx(2, rel=1e-2)
     assert deviation[1] / deviation[2] == pytest.approx(2, rel=1e-2)
 

@@ -105,14 +105,16 @@ def test_a_small_bias_of_every_trajectory_is_found_in_their_mean(network):
 
 
 def test_a_product_that_is_too_sure_is_doubted_where_single_answers_are_not(network):
-    """Runs that are the same say no more than one does, and the network thinks that they do."""
+    """Runs of which most of the noise is the same say little more than one does."""
 
     def once(theta):
-        few = simulate(theta[::4], "runs of one robot")
-        return few.repeat_interleave(4, 0)[: len(theta)]
+        few = simulate(theta[::4], "runs of one robot").repeat_interleave(4, 0)[: len(theta)]
+        exact = torch.cat([theta[:, :1], 2 * theta[:, :1]], -1)
+        own = simulate(theta, "each run") - exact
+        return exact + 0.9 * (few - exact) + 0.44 * own
 
     real = once(torch.tensor([[0.4, 0.5]]).expand(4, 2))
-    found = trust(network, real, simulate=once, truths=50)
+    found = trust(network, real, simulate=once, truths=100)
     assert found.calibration.passed
     assert not found.pooled.passed
     assert any("answer for 4 trajectories together is too sure" in text for text in found.doubts)

@@ -19,6 +19,7 @@ from ..kinds import check_choice, check_kind
 from ..randomness import generator
 from ..scalars import check_number
 from .descent import descend
+from .design_effect import shared_by_neighbours
 from .features import FourierFeatures
 from .input_scaling import input_scaling
 from .posterior import MixtureDensityPosterior
@@ -28,7 +29,7 @@ from .usable_pairs import in_floats, rows_that_count, usable_pairs, usable_rows,
 from .weights import effective_sample_size, weights_of
 from .widening import widen
 
-_SEEN = 1000  # summaries kept to compare real ones with
+_SEEN = 1000  # summaries kept to compare real ones with, and pairs that are neighbours
 _FEWEST = 50  # held-out pairs that choose how wide an average is
 _HELD_OUT = 2**14  # pairs are enough to choose an epoch by, and all are held in memory
 
@@ -190,7 +191,21 @@ def fit_several(
     averaged = together and effective_sample_size(weights_of(validation)) >= _FEWEST
     for group in [posteriors] if averaged else [[posterior] for posterior in posteriors]:
         widen(group, validation)
+    near = data[order[:_SEEN]]
+    for posterior in posteriors:
+        _learn_shared(posterior, near)
     return [FitReport(len(rows), dropped, len(trace[0]), *trace) for trace in traces]
+
+
+@torch.no_grad()
+def _learn_shared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> None:
+    """Set how much of what its answers leave open several trajectories leave open together."""
+    summary = pairs.get(posterior.summary_key)
+    with torch.autocast(summary.device.type, enabled=False):
+        each = posterior.distribution(summary).mixture
+    z = posterior.prior.standardize(pairs.get(posterior.theta_key)).to(each.loc)
+    bounded = posterior.prior.box is not None
+    posterior.network.shared.copy_(shared_by_neighbours(each, z, bounded=bounded))
 
 
 def _groups(

@@ -85,6 +85,7 @@ class MixtureDensityNetwork(nn.Module):
     contrast: Tensor  # power to which they are raised before that, shape (D,)
     tails: Tensor  # logarithm of the ratio of :func:`heavy_tailed`, shape (1,), or (0,) for none
     apart: Tensor  # share of its distance from the mean of an average that is left there, (D,)
+    shared: Tensor  # of what answers leave open, the share that trajectories leave together, (D,)
 
     def __init__(
         self,
@@ -121,6 +122,7 @@ class MixtureDensityNetwork(nn.Module):
         self.register_buffer("contrast", torch.ones(parameters))
         self.register_buffer("tails", torch.zeros(0))
         self.register_buffer("apart", torch.ones(parameters))
+        self.register_buffer("shared", torch.zeros(parameters))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         widening = state_dict.get(f"{prefix}widening")
@@ -130,16 +132,19 @@ class MixtureDensityNetwork(nn.Module):
             # of before: none
             for name in ("contrast", "apart"):
                 state_dict.setdefault(f"{prefix}{name}", torch.ones_like(widening))
+            state_dict.setdefault(f"{prefix}shared", torch.zeros_like(widening))
             tails = state_dict.setdefault(f"{prefix}tails", widening.new_zeros(0))
             self.tails = self.tails.new_zeros(len(tails))
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take a pickled network; those of before have no contrast, no tails, or no share."""
+        """Take a pickled network; those of before lack some of its scales and shares."""
         super().__setstate__(state)
         for name in ("contrast", "apart"):
             if name not in self._buffers:
                 self.register_buffer(name, torch.ones_like(self.widening))
+        if "shared" not in self._buffers:
+            self.register_buffer("shared", torch.zeros_like(self.widening))
         if "tails" not in self._buffers:
             self.register_buffer("tails", self.widening.new_zeros(0))
 

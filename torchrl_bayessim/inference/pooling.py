@@ -8,6 +8,7 @@ For trajectories that are independent given the parameters,
 In standardised coordinates a box prior is constant and drops out, and a Gaussian prior is N(0, I).
 The product of mixtures is a mixture again; after every factor it is reduced to a bounded number of
 components. The factors are sorted first, so the order of the trajectories does not matter.
+What answers leave open together, no product of them closes: see :mod:`.design_effect`.
 """
 
 from __future__ import annotations
@@ -15,19 +16,25 @@ from __future__ import annotations
 __all__ = ["pool"]
 
 import torch
+from torch import Tensor
 
+from .design_effect import widened
 from .mixtures import Mixture, divide, multiply, reduce
 from .truncation import TruncatedGaussianMixture
 
 MAX_COMPONENTS = 24
 
 
-def pool(each: TruncatedGaussianMixture, *, bounded: bool) -> TruncatedGaussianMixture:
+def pool(
+    each: TruncatedGaussianMixture, *, bounded: bool, shared: Tensor | None = None
+) -> TruncatedGaussianMixture:
     """Return the pooled posterior of a batch ``(n,)`` of posteriors, in standardised coordinates.
 
     Args:
         each: One mixture per trajectory, batch shape ``(n,)``.
         bounded: Whether the prior is a box (constant in these coordinates) or N(0, I).
+        shared: Of what each leaves open in every parameter, the share that all leave open
+            together, shape ``(D,)``; default none of it.
 
     Example:
         >>> each = TruncatedGaussianMixture(torch.zeros(4, 1), torch.zeros(4, 1, 1),
@@ -38,7 +45,9 @@ def pool(each: TruncatedGaussianMixture, *, bounded: bool) -> TruncatedGaussianM
     parts = (each.loc, each.logits, each.scale_tril)
     keys = torch.cat([part.flatten(1) for part in parts], -1).tolist()
     order = sorted(range(len(keys)), key=keys.__getitem__)
-    factors = [Mixture(each.untruncated_logits[i], each.loc[i], each.scale_tril[i]) for i in order]
+    none = each.loc.new_zeros(each.loc.shape[-1])
+    answers = widened(each, none if shared is None else shared, bounded=bounded)
+    factors = [Mixture(*(part[i] for part in answers)) for i in order]
     product = factors[0]
     identity = torch.eye(each.loc.shape[-1]).to(each.loc)
     for factor in factors[1:]:

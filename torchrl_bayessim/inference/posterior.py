@@ -31,6 +31,7 @@ from torch import Tensor
 from ..counts import check_count
 from ..errors import message
 from ..kinds import check_choice, check_kind, real_numbers
+from .design_effect import shared_by_rows
 from .features import Features, FourierFeatures, NeuralFeatures, ResidualFeatures
 from .misspecification import doubts
 from .mixtures import Mixture
@@ -207,7 +208,8 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
                 unequal lengths, fit it to summaries of all n together, as
                 :meth:`.SummaryStatistics.together` makes them and the loop does.
             pooling: ``"product"``: :math:`\prod_i q(\theta \mid x_i) / p(\theta)^{n-1}`, the
-                posterior of independent trajectories, so that more data sharpen it;
+                posterior of independent trajectories, so that more data sharpen it, with each
+                answer as wide as :mod:`.design_effect` finds that they err together;
                 ``"mean"``: the posterior of the averaged summary, as the paper does, which does
                 not become sharper with n.
             check: Whether to look for reasons to doubt the result.
@@ -242,7 +244,11 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         if pooling == "mean":
             summaries = summaries.mean(0, keepdim=True)
         each = self.distribution(summaries).mixture
-        found = PhysicsPosterior(pool(each, bounded=self.prior.box is not None), self.prior)
+        bounded = self.prior.box is not None
+        shared = torch.maximum(
+            self.network.shared.to(each.loc), shared_by_rows(each, bounded=bounded)
+        )
+        found = PhysicsPosterior(pool(each, bounded=bounded, shared=shared), self.prior)
         if check and self.seen is not None:
             for doubt in doubts(self.seen.to(summaries), summaries, found):
                 warnings.warn(doubt, stacklevel=3)  # past the decorator
