@@ -203,8 +203,7 @@ def answered(settings: Recovery, name: str, seed: int) -> dict[str, Any]:
             some = slice(-1 - POOLED if method == BY_PRODUCT else 0, None)
             answer = fitted(tests[some], given[some])
             found[f"{method}{kind}"] = entry(answer, prior, tests[some]) | {"seconds_fit": spent}
-            # a product of ten makes something of nothing: what is said is said without it
-            if condition is not None and method != BY_PRODUCT:
+            if condition is not None:
                 pictured["posterior"] = condition(given[-1])
         once = not problem.costly or seed == settings.seed
         if settings.paper_mode and settings.online and once and kind != PAPER:

@@ -63,6 +63,37 @@ def test_refinements_close_in_on_the_truth_and_report_what_they_used(prior):
     torch.testing.assert_close(made.trust.posterior.mean, made.posterior.mean)
 
 
+def test_the_report_says_whether_simulations_at_the_posterior_give_the_data_where_asked():
+    truth, asked = torch.tensor([[0.4, 2.0]]), []
+    simulate = noisy(BOX)
+    made = PosteriorRefinement(BOX, simulations=300, predictive=120, fit_options=QUICK)
+    made.refine(
+        lambda theta: asked.append(len(theta)) or simulate(theta),
+        noisy(BOX, 7)(truth)[0],
+        key=(0,),
+    )
+    assert asked == [300, 120]
+    assert made.trust.predictive > 0.05
+    assert made.settings["predictive"] == 120
+    off = lambda theta: noisy(BOX, len(theta))(theta) + (5.0 if len(theta) == 120 else 0.0)
+    with pytest.warns(UserWarning, match=r"only 0\.8% of 120 simulations at the posterior"):
+        made.refine(off, noisy(BOX, 7)(truth)[0], key=(1,))
+    assert made.trust.predictive < 0.01
+
+
+def test_a_report_on_several_trajectories_says_that_their_answer_together_was_not_checked():
+    made = refinement()
+    rows = noisy(BOX, 7)(torch.tensor([[0.4, 2.0]]).expand(3, -1))
+    made.refine(noisy(BOX), rows, key=(0,))
+    assert made.trust.trajectories == 3
+    assert "calibration of 3 together" in str(made.trust)
+
+
+def test_too_few_simulations_for_a_predictive_check_are_refused():
+    with pytest.raises(ValueError, match="99"):
+        PosteriorRefinement(BOX, predictive=50)
+
+
 def test_a_second_refinement_simulates_around_the_first_posterior():
     observed = torch.tensor([0.5, 0.5, 0.5, 0.5])
     made, asked = refinement(), []

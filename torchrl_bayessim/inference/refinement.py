@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping
 from numbers import Real
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from ..counts import check_count
@@ -33,7 +34,7 @@ from .posterior import MixtureDensityPosterior
 from .priors import BoxPrior, Prior, check_prior
 from .proposals import focus, importance_weights
 from .truncation import TruncatedGaussianMixture
-from .trust import Trust, reported
+from .trust import LEAST_SIMULATIONS, Trust, reported, with_predictive
 
 
 class PosteriorRefinement:
@@ -48,6 +49,8 @@ class PosteriorRefinement:
         make_posterior: ``(prior, summary size)`` to a fresh network; a default one if omitted.
         margin: Widening of the box around the last posterior, as a share of it: see
             :func:`.proposals.focus`.
+        predictive: Further simulations, each time that :meth:`refine` has conditioned, which tell
+            whether the posterior gives the real summary: at least 99; 0 for no such check.
         prior_share: Share of prior draws where importance weights are used; bounds them by its
             inverse.
         seed: Same seed, same refinements.
@@ -57,8 +60,9 @@ class PosteriorRefinement:
         posterior: The last posterior; ``None`` before the first refinement.
         network: The networks that gave it, for other real data; ``None`` before the first
             refinement, and after a state was loaded.
-        trust: What is to be said of it without further simulations: what the data tell about each
-            parameter, calibration and doubts, see :mod:`.trust`; ``None`` as ``network`` is.
+        trust: What is to be said of it: what the data tell about each parameter, calibration,
+            doubts and, with ``predictive``, whether simulations at it give the real summary, see
+            :mod:`.trust`; ``None`` as ``network`` is.
 
     Raises:
         TypeError: The prior is none of :mod:`.priors`, or a count is no whole number.
@@ -85,6 +89,7 @@ class PosteriorRefinement:
         networks: int = NETWORKS,
         make_posterior: PosteriorMaker | None = None,
         margin: float = 1.0,
+        predictive: int = 0,
         prior_share: float = 0.25,
         seed: int = 0,
         fit_options: Mapping[str, Any] | None = None,
@@ -95,6 +100,8 @@ class PosteriorRefinement:
         if not (isinstance(margin, Real) and 0 <= margin < math.inf):
             raise ValueError(message("a finite margin of 0 or more", margin))
         check_prior_share(prior_share)
+        if predictive != 0:
+            check_count("predictive", predictive, least=LEAST_SIMULATIONS)
         check_fit_options({} if fit_options is None else fit_options)
         if make_posterior is not None:
             expected = "make_posterior, a function of the prior and the summary's size"
@@ -102,6 +109,7 @@ class PosteriorRefinement:
         self.prior, self.simulations, self.networks = prior, simulations, networks
         self.make_posterior = MixtureDensityPosterior if make_posterior is None else make_posterior
         self.margin, self.prior_share, self.seed = margin, prior_share, seed
+        self.predictive = predictive
         self.fit_options = {} if fit_options is None else dict(fit_options)
         self.posterior: PhysicsPosterior | None = None
         self.network: AveragedPosterior | None = None
@@ -119,6 +127,8 @@ class PosteriorRefinement:
             "prior_share": self.prior_share,
             "seed": self.seed,
             "fit_options": repr({k: v for k, v in self.fit_options.items() if k != "progress"}),
+            # not there in checkpoints of before
+            **({"predictive": self.predictive} if self.predictive else {}),
         }
 
     def refine(
@@ -146,7 +156,23 @@ class PosteriorRefinement:
         check_draw_key(key)
         check_function("simulate, a function of parameters (N, D)", simulate)
         theta = draw(self.proposal(), self.simulations, key=(self.seed, *key, "theta"))
-        return self.learn(theta, simulate(theta), observed, key=key, progress=progress)
+        report = self.learn(theta, simulate(theta), observed, key=key, progress=progress)
+        if self.predictive:
+            self._check(simulate, observed, key=key)
+        return report
+
+    def _check(
+        self, simulate: Callable[[Tensor], Tensor], observed: Tensor, *, key: tuple[int | str, ...]
+    ) -> None:
+        """Add to the report whether simulations at the posterior give the real summary."""
+        assert self.trust is not None
+        own = seed_from(self.seed, *key, "predictive")
+        before = self.trust.doubts
+        self.trust = with_predictive(
+            self.trust, simulate, observed, simulations=self.predictive, seed=own
+        )
+        for doubt in self.trust.doubts[len(before) :]:
+            warnings.warn(doubt, stacklevel=3)
 
     def proposal(self) -> Any:
         """Return the source that the parameters of the next pairs are to be drawn from."""
@@ -193,7 +219,14 @@ class PosteriorRefinement:
         for doubt in found:
             warnings.warn(doubt, stacklevel=2)
         own = seed_from(self.seed, *key, "trust")
-        self.trust = reported(self.network, self.posterior, found, prior=self.prior, seed=own)
+        self.trust = reported(
+            self.network,
+            self.posterior,
+            found,
+            trajectories=len(torch.atleast_2d(observed)),
+            prior=self.prior,
+            seed=own,
+        )
         return report
 
     def _proposal(self) -> tuple[Prior, Any]:

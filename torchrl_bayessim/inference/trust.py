@@ -15,7 +15,7 @@ needs the simulator:
 
 from __future__ import annotations
 
-__all__ = ["Trust", "reported", "trust"]
+__all__ = ["LEAST_SIMULATIONS", "Trust", "reported", "trust", "with_predictive"]
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -41,6 +41,7 @@ from .priors import Prior
 _FEWEST = 50  # pairs, below which shares say too little
 _ALIKE = 20  # simulations of which the parameters are nearly the same
 _SURPRISE = 0.01  # share below which the real data are a surprise to the posterior
+LEAST_SIMULATIONS = round(1 / _SURPRISE) - 1  # that can tell such a share
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,7 @@ def trust(
         True
     """
     check_kind("a MixtureDensityPosterior", network, MixtureDensityPosterior, AveragedPosterior)
-    check_count("simulations", simulations, least=round(1 / _SURPRISE) - 1)
+    check_count("simulations", simulations, least=LEAST_SIMULATIONS)
     if simulate is not None:
         check_function("simulate, a function of parameters (N, D)", simulate)
     if held_out is not None:
@@ -143,13 +144,39 @@ def trust(
     rows = torch.atleast_2d(real_summaries(observed))
     posterior = network.condition(rows, check=False)
     found = doubts(network.seen, rows, posterior)
-    told = reported(network, posterior, found, prior=prior, held_out=held_out, seed=seed)
-    told = replace(told, trajectories=len(rows))
+    count = len(rows)
+    told = reported(
+        network, posterior, found, trajectories=count, prior=prior, held_out=held_out, seed=seed
+    )
     if simulate is None:
         return told
-    if len(rows) > 1 and truths:
+    if count > 1 and truths:
         told = _with_pooled(told, network, simulate, rows, truths=truths, seed=seed)
-    theta = draw(posterior, simulations, key=(seed, "predictive"))
+    return with_predictive(told, simulate, rows, simulations=simulations, seed=seed)
+
+
+def with_predictive(
+    told: Trust,
+    simulate: Callable[[Tensor], Tensor],
+    observed: Tensor,
+    *,
+    simulations: int,
+    seed: int = 0,
+) -> Trust:
+    """Return the report with a posterior predictive check.
+
+    Args:
+        told: Without one.
+        simulate: As of :func:`trust`.
+        observed: As of :func:`trust`.
+        simulations: As of :func:`trust`.
+        seed: Same seed, same parameters.
+
+    Raises:
+        ValueError: ``simulate`` does not give a summary like it for each simulation.
+    """
+    rows = torch.atleast_2d(observed)
+    theta = draw(told.posterior, simulations, key=(seed, "predictive"))
     predicted = _predicted(simulate, theta, rows)
     finite = predicted.isfinite().all(-1)
     theta, predicted = theta[finite], predicted[finite]
@@ -172,6 +199,7 @@ def reported(
     posterior: PhysicsPosterior,
     found: Sequence[str],
     *,
+    trajectories: int = 1,
     prior: Prior | None = None,
     held_out: TensorDictBase | None = None,
     seed: int = 0,
@@ -182,6 +210,7 @@ def reported(
         network: As of :func:`trust`.
         posterior: Given the real data.
         found: Doubts of :func:`.misspecification.doubts`.
+        trajectories: How many it was conditioned to together.
         prior: As of :func:`trust`.
         held_out: As of :func:`trust`.
         seed: Of the calibration.
@@ -192,7 +221,8 @@ def reported(
         calibration = calibrate(network, pairs, seed=seed)
         found = [*found, *calibration.doubts()]
     told = identifiability(posterior, prior=prior)
-    return Trust(posterior, tuple(found), told, calibration, predictive=None)
+    doubted = tuple(found)
+    return Trust(posterior, doubted, told, calibration, predictive=None, trajectories=trajectories)
 
 
 def _with_pooled(
