@@ -8,7 +8,7 @@ protocol (1,000 trajectories of at most 200 steps, 10 real ones): its networks w
 full covariance and the mean of the statistics of the real trajectories, once with its own
 statistics and once with ours; and "BayesSim pooled", our defaults, which multiply the posteriors
 of the ten; and methods that simulate for one observation, with the first seed only where a
-thousand simulations take a minute. Otherwise our defaults, the average of three networks, beside
+thousand simulations take a minute, where other truths are a third as many, too. Otherwise our defaults, the average of three networks, beside
 sbi's NPE (extra ``sbi``) on the same pairs. Log-densities at one truth reward a posterior that is
 too sure, so nats over the prior and coverage over many other truths stand beside them. Writes
 result.json, table.md and a picture per problem; finished parts are kept in ``out``, so that the
@@ -69,7 +69,7 @@ class Recovery(recipe.Settings):
     paper_mode: bool = False
     simulations: int = 1000
     seeds: int = 5  # repetitions, from seed on
-    truths: int = 64  # other truths per seed, for nats and coverage
+    truths: int = 64  # other truths per seed, for nats and coverage; see `Problem.costly`
     npe: bool = True  # sbi's NPE beside our defaults, if sbi is installed
     online: bool = True  # in paper_mode: methods that simulate for one observation
     processes: int = 2
@@ -189,7 +189,10 @@ def answered(settings: Recovery, name: str, seed: int) -> dict[str, Any]:
     seconds = time.perf_counter() - start
     truth = torch.tensor([[problem.truth[n] for n in prior.names]])
     # the last row is the truth of the table
-    tests = torch.cat([draw(prior, settings.truths, key=(seed, "truths")), truth])
+    # in paper_mode each takes ten trajectories
+    few = settings.paper_mode and problem.costly
+    others = max(1, settings.truths // 3) if few else settings.truths
+    tests = torch.cat([draw(prior, others, key=(seed, "truths")), truth])
     observed = lab(tests, real=True)
     found: dict[str, Any] = {}
     pictured: dict[str, Any] = {}

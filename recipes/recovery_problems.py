@@ -57,8 +57,9 @@ class Problem:
         summaries: Statistics of our own defaults.
         paper_summaries: Statistics of the paper.
         unidentifiable: Parameters that do not enter the dynamics.
-        costly: Whether a thousand trajectories take a minute, not seconds: methods that simulate
-            for one observation are asked with the first seed only.
+        costly: Whether a thousand trajectories take a minute, not seconds: in paper_mode methods
+            that simulate for one observation are asked with the first seed only, and other truths
+            are a third as many.
         needs: Package that the simulator needs beyond the main dependencies.
     """
 
