@@ -40,7 +40,7 @@ def erring(share, count=1000, *, key=0):
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.8])
 def test_neighbours_tell_the_share_of_the_error_that_they_have_in_common(share):
     found = [
-        shared_by_neighbours(each, z, bounded=True).item()
+        shared_by_neighbours(each.untruncated, z, bounded=True).item()
         for z, each in (erring(share, key=key) for key in range(5))
     ]
     assert sum(found) / 5 == pytest.approx(share, abs=0.06)
@@ -52,13 +52,18 @@ def test_under_a_gaussian_prior_what_the_prior_pulls_is_no_error():
     exact = 1 / (1 + noise**-2)
     x = z + noise * randn(1500, 1, key="noise")
     each = answers(exact * x / noise**2, exact**0.5)
-    assert shared_by_neighbours(each, z, bounded=False).item() < 0.06
-    assert shared_by_neighbours(each, z, bounded=True).item() > 0.2  # without the prior's score
+    assert shared_by_neighbours(each.untruncated, z, bounded=False).item() < 0.06
+    assert (
+        shared_by_neighbours(each.untruncated, z, bounded=True).item() > 0.2
+    )  # without the prior's score
 
 
 @pytest.mark.parametrize("n", [2, 5, 20])
 def test_rows_of_a_right_answer_seldom_seem_to_share_anything(n):
-    found = [shared_by_rows(answers(randn(n, 1, key=(n, k))), bounded=True) for k in range(400)]
+    found = [
+        shared_by_rows(answers(randn(n, 1, key=(n, k))).untruncated, bounded=True)
+        for k in range(400)
+    ]
     assert (torch.stack(found) > 0).double().mean() < 0.08  # 5 % expected
 
 
@@ -66,7 +71,7 @@ def test_rows_of_a_right_answer_seldom_seem_to_share_anything(n):
 def test_rows_give_a_lower_bound_that_comes_near_with_many(share):
     def found(n, key):
         rows = (1 - share) ** 0.5 * randn(n, 1, key=key) + share**0.5
-        return shared_by_rows(answers(rows), bounded=True)
+        return shared_by_rows(answers(rows).untruncated, bounded=True)
 
     few = torch.stack([found(10, key) for key in range(200)])
     assert (few <= share).double().mean() > 0.92
@@ -79,12 +84,12 @@ def test_weak_data_under_a_gaussian_prior_are_not_taken_for_a_shared_error(noise
     x = 0.5 + noise * randn(200, 1, key="weak")
     exact = 1 / (1 + noise**-2)
     each = answers(exact * x / noise**2, exact**0.5)
-    assert shared_by_rows(each, bounded=False).item() == pytest.approx(0, abs=0.05)
+    assert shared_by_rows(each.untruncated, bounded=False).item() == pytest.approx(0, abs=0.05)
 
 
 def test_the_same_trajectory_again_says_nothing_new():
     each = answers(0.4 * torch.ones(7, 2, dtype=torch.float64), 0.3)
-    pooled = pool(each, bounded=True, shared=shared_by_rows(each, bounded=True))
+    pooled = pool(each, bounded=True, shared=shared_by_rows(each.untruncated, bounded=True))
     assert torch.allclose(pooled.scale_tril[0].diagonal(), 0.3 * torch.ones(2).double())
 
 
@@ -110,8 +115,8 @@ def test_parameters_share_errors_each_by_its_own():
 
 def test_one_trajectory_is_left_as_it_is():
     each = answers(randn(1, 2, key="one"))
-    assert torch.equal(shared_by_rows(each, bounded=True), torch.zeros(2).double())
-    alone = widened(each, torch.tensor([0.5, 0.9]), bounded=True)
+    assert torch.equal(shared_by_rows(each.untruncated, bounded=True), torch.zeros(2).double())
+    alone = widened(each.untruncated, torch.tensor([0.5, 0.9]), bounded=True)
     assert torch.equal(alone.scale_tril, each.scale_tril)
 
 

@@ -226,7 +226,7 @@ def test_restriction_keeps_the_shape_of_the_untruncated_mixture():
     where = 2 * torch.rand(50, 2, generator=generator(0), dtype=torch.float64) - 1
     ratio = free.log_prob(where) - restricted.log_prob(where)
     torch.testing.assert_close(ratio, ratio[:1].expand(50))  # one constant: the mass inside
-    torch.testing.assert_close(restricted.untruncated_logits, free.logits)
+    torch.testing.assert_close(restricted.untruncated.logits, free.logits)
     # the far component has lost nearly all of its weight
     assert restricted.logits.exp()[1] < 0.1
 

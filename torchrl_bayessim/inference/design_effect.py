@@ -36,22 +36,17 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from .mixtures import Mixture, moment_match
-from .truncation import TruncatedGaussianMixture
 
 _NEIGHBOURS = 3
 _FARTHEST = 3.0  # deviations, beyond which a score says no more
 _SURE = 0.05  # chance of rows that share nothing to lie so close together
 
 
-def _untruncated(each: TruncatedGaussianMixture) -> Mixture:
-    return Mixture(each.untruncated_logits, each.loc, each.scale_tril)
-
-
-def shared_by_neighbours(each: TruncatedGaussianMixture, z: Tensor, *, bounded: bool) -> Tensor:
+def shared_by_neighbours(each: Mixture, z: Tensor, *, bounded: bool) -> Tensor:
     """Return the share of the scores' mean square that pairs of near parameters have in common.
 
     Args:
-        each: The answer to every pair's summary, batch shape ``(N,)``.
+        each: The answer to every pair's summary, whatever a box cuts off, batch shape ``(N,)``.
         z: Its parameters in standardised coordinates, shape ``(N, D)``.
         bounded: Whether the prior is a box (constant in these coordinates) or N(0, I).
 
@@ -63,8 +58,7 @@ def shared_by_neighbours(each: TruncatedGaussianMixture, z: Tensor, *, bounded: 
         >>> g = torch.Generator().manual_seed(0)
         >>> noise = torch.randn(2, 200, 1, generator=g, dtype=torch.float64) / 2**0.5
         >>> scale = torch.ones(200, 1, 1, 1, dtype=torch.float64)
-        >>> answers = lambda loc: TruncatedGaussianMixture(torch.zeros(200, 1), loc[:, None], scale,
-        ...                                                None)
+        >>> answers = lambda loc: Mixture(0 * loc, loc[:, None], scale)
         >>> own = shared_by_neighbours(answers(z + noise.sum(0)), z, bounded=True)
         >>> common = shared_by_neighbours(answers(z + noise[0] + 0.7), z, bounded=True)
         >>> own.item() < 0.1, 0.4 < common.item() < 0.6
@@ -72,7 +66,7 @@ def shared_by_neighbours(each: TruncatedGaussianMixture, z: Tensor, *, bounded: 
     """
     if len(z) < 2:
         return z.new_zeros(z.shape[-1])
-    score = _score(_untruncated(each), z, bounded=bounded).clamp(-_FARTHEST, _FARTHEST)
+    score = _score(each, z, bounded=bounded).clamp(-_FARTHEST, _FARTHEST)
     apart = torch.cdist(z, z).fill_diagonal_(torch.inf)
     near = apart.topk(min(_NEIGHBOURS, len(z) - 1), largest=False).indices
     common = (score.unsqueeze(1) * score[near]).mean((0, 1))
@@ -92,7 +86,7 @@ def _score(mixture: Mixture, z: Tensor, *, bounded: bool) -> Tensor:
     return score * covariance.diagonal(dim1=-2, dim2=-1).sqrt()
 
 
-def shared_by_rows(each: TruncatedGaussianMixture, *, bounded: bool) -> Tensor:
+def shared_by_rows(each: Mixture, *, bounded: bool) -> Tensor:
     r"""Return the least share that answers to n trajectories of one system have in common.
 
     In Gaussian terms, with :math:`\Lambda_i` and :math:`\mu_i` of each answer, scores at one point
@@ -108,15 +102,14 @@ def shared_by_rows(each: TruncatedGaussianMixture, *, bounded: bool) -> Tensor:
 
     Example:
         >>> scale = torch.ones(20, 1, 1, 1, dtype=torch.float64)
-        >>> answers = lambda loc: TruncatedGaussianMixture(torch.zeros(20, 1), loc[:, None, None],
-        ...                                                scale, None)
+        >>> answers = lambda loc: Mixture(0 * loc[:, None], loc[:, None, None], scale)
         >>> x = torch.randn(20, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         >>> shared_by_rows(answers(x), bounded=True).item()
         0.0
         >>> shared_by_rows(answers(x / 10), bounded=True).item() > 0.9
         True
     """
-    mean, covariance = moment_match(_untruncated(each))
+    mean, covariance = moment_match(each)
     n, size = mean.shape
     if n < 2:
         return mean.new_zeros(size)
@@ -129,7 +122,7 @@ def shared_by_rows(each: TruncatedGaussianMixture, *, bounded: bool) -> Tensor:
     return torch.where(claimed > 0, share, torch.zeros_like(share))
 
 
-def widened(each: TruncatedGaussianMixture, shared: Tensor, *, bounded: bool) -> Mixture:
+def widened(each: Mixture, shared: Tensor, *, bounded: bool) -> Mixture:
     r"""Return answers to n trajectories of which the product is as sure as they are together.
 
     The likelihood of each component, :math:`N(\mu, \Lambda^{-1}) / p`, is made wider by the root of
@@ -141,15 +134,14 @@ def widened(each: TruncatedGaussianMixture, shared: Tensor, *, bounded: bool) ->
         shared: The share :math:`\\rho` of each parameter, shape ``(D,)``.
         bounded: As of :func:`shared_by_neighbours`.
     """
-    mixture = _untruncated(each)
-    wider = (1 + (len(mixture.loc) - 1) * shared.to(mixture.loc)).sqrt()
+    wider = (1 + (len(each.loc) - 1) * shared.to(each.loc)).sqrt()
     if (wider == 1).all():
-        return mixture
-    scale = wider.unsqueeze(-1) * mixture.scale_tril
+        return each
+    scale = wider.unsqueeze(-1) * each.scale_tril
     if bounded:
-        return mixture._replace(scale_tril=scale)
+        return each._replace(scale_tril=scale)
     precision = torch.cholesky_inverse(scale)
-    pull = precision @ mixture.loc.unsqueeze(-1)
+    pull = precision @ each.loc.unsqueeze(-1)
     total = precision + torch.diag(1 - wider.pow(-2))
     loc = torch.linalg.solve(total, pull).squeeze(-1)
-    return Mixture(mixture.logits, loc, torch.linalg.cholesky(torch.linalg.inv(total)))
+    return Mixture(each.logits, loc, torch.linalg.cholesky(torch.linalg.inv(total)))

@@ -19,7 +19,6 @@ from ..kinds import check_choice, check_kind
 from ..randomness import generator
 from ..scalars import check_number
 from .descent import descend
-from .design_effect import shared_by_neighbours
 from .features import FourierFeatures
 from .input_scaling import input_scaling
 from .posterior import MixtureDensityPosterior
@@ -27,7 +26,7 @@ from .rows import Rows, mapped
 from .stacked import alike
 from .usable_pairs import in_floats, rows_that_count, usable_pairs, usable_rows, warn_of
 from .weights import effective_sample_size, weights_of
-from .widening import widen
+from .widening import learn_shared, widen
 
 _SEEN = 1000  # summaries kept to compare real ones with, and pairs that are neighbours
 _FEWEST = 50  # held-out pairs that choose how wide an average is
@@ -193,19 +192,8 @@ def fit_several(
         widen(group, validation)
     near = data[order[:_SEEN]]
     for posterior in posteriors:
-        _learn_shared(posterior, near)
+        learn_shared(posterior, near)
     return [FitReport(len(rows), dropped, len(trace[0]), *trace) for trace in traces]
-
-
-@torch.no_grad()
-def _learn_shared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> None:
-    """Set how much of what its answers leave open several trajectories leave open together."""
-    summary = pairs.get(posterior.summary_key)
-    with torch.autocast(summary.device.type, enabled=False):
-        each = posterior.distribution(summary).mixture
-    z = posterior.prior.standardize(pairs.get(posterior.theta_key)).to(each.loc)
-    bounded = posterior.prior.box is not None
-    posterior.network.shared.copy_(shared_by_neighbours(each, z, bounded=bounded))
 
 
 def _groups(

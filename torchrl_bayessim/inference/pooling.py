@@ -46,7 +46,7 @@ def pool(
     keys = torch.cat([part.flatten(1) for part in parts], -1).tolist()
     order = sorted(range(len(keys)), key=keys.__getitem__)
     none = each.loc.new_zeros(each.loc.shape[-1])
-    answers = widened(each, none if shared is None else shared, bounded=bounded)
+    answers = widened(each.untruncated, none if shared is None else shared, bounded=bounded)
     factors = [Mixture(*(part[i] for part in answers)) for i in order]
     product = factors[0]
     identity = torch.eye(each.loc.shape[-1]).to(each.loc)

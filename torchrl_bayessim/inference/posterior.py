@@ -246,7 +246,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         each = self.distribution(summaries).mixture
         bounded = self.prior.box is not None
         shared = torch.maximum(
-            self.network.shared.to(each.loc), shared_by_rows(each, bounded=bounded)
+            self.network.shared.to(each.loc), shared_by_rows(each.untruncated, bounded=bounded)
         )
         found = PhysicsPosterior(pool(each, bounded=bounded, shared=shared), self.prior)
         if check and self.seen is not None:

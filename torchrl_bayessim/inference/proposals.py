@@ -271,7 +271,7 @@ def analytic_correction(
                 hint='correction="importance", which is right for mixtures',
             )
         )
-    dividend = Mixture(mixture.untruncated_logits, mixture.loc, mixture.scale_tril)
+    dividend = mixture.untruncated
     bounded = learned.prior.box is not None
     if not bounded:  # the prior is N(0, I) here, not a constant
         # before the division: a precision may need the prior's to stay positive

@@ -26,7 +26,7 @@ import torch
 from torch import Size, Tensor
 from torch.distributions import Distribution
 
-from .mixtures import component_log_prob
+from .mixtures import Mixture, component_log_prob
 from .truncated_normal import log_interval, truncated_quantile
 
 POINTS = 256  # quasi-random points for the mass of a correlated component
@@ -187,9 +187,10 @@ class TruncatedGaussianMixture(Distribution):
         return self._log_mass
 
     @property
-    def untruncated_logits(self) -> Tensor:
-        r"""The log-weights :math:`\log \alpha_k` of the Gaussians before truncation, ``(*, K)``."""
-        return (self.logits - self.log_mass).log_softmax(-1)
+    def untruncated(self) -> Mixture:
+        r"""The Gaussian mixture :math:`\sum_k \alpha_k N_k` that was restricted to the box."""
+        logits = (self.logits - self.log_mass).log_softmax(-1)
+        return Mixture(logits, self.loc, self.scale_tril)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-density, ``-inf`` outside the box, shape ``(*)``."""

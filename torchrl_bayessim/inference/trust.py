@@ -215,6 +215,11 @@ def reported(
         held_out: As of :func:`trust`.
         seed: Of the calibration.
     """
+    if network.seen is not None and len(network.seen) < _FEWEST:
+        few = (
+            f"it was fitted to {len(network.seen)} pairs only, too few to tell what it gets wrong."
+        )
+        found = [*found, few]
     pairs = _unweighted(network.held_out) if held_out is None else held_out
     calibration = None
     if pairs is not None and len(pairs) >= _FEWEST:

@@ -31,7 +31,7 @@ each, of 0, 0.35, 0.55 and 0.75).
 
 from __future__ import annotations
 
-__all__ = ["average", "widen"]
+__all__ = ["average", "learn_shared", "widen"]
 
 import math
 from collections.abc import Sequence
@@ -44,6 +44,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 
+from .design_effect import shared_by_neighbours
 from .network import Components, widened
 from .posterior import TRAINING_POINTS, MixtureDensityPosterior
 from .truncation import TruncatedGaussianMixture
@@ -127,6 +128,27 @@ def widen(networks: Sequence[MixtureDensityPosterior], held_out: TensorDictBase)
         network.network.tails = tails.to(network.network.tails)
         network.network.apart.copy_(values[-size:])
     return values[:size].exp()
+
+
+@torch.no_grad()
+def learn_shared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> None:
+    """Set how much of what its answers leave open several trajectories leave open together.
+
+    Args:
+        posterior: As wide as it is to be; changed in place.
+        pairs: Some of those of its fit: see :func:`.design_effect.shared_by_neighbours`.
+    """
+    summary = pairs.get(posterior.summary_key)
+    with torch.autocast(summary.device.type, enabled=False):
+        each = TruncatedGaussianMixture(
+            *posterior.network(summary),
+            posterior.prior.box,
+            diagonal=posterior.network.covariance == "diagonal",
+            points=TRAINING_POINTS,
+        ).untruncated
+    z = posterior.prior.standardize(pairs.get(posterior.theta_key)).to(each.loc)
+    bounded = posterior.prior.box is not None
+    posterior.network.shared.copy_(shared_by_neighbours(each, z, bounded=bounded))
 
 
 def _usual(size: int, *, alone: bool) -> list[float]:
