@@ -8,9 +8,10 @@ protocol (1,000 trajectories of at most 200 steps, 10 real ones): its networks w
 full covariance and the mean of the statistics of the real trajectories, once with its own
 statistics and once with ours; and "BayesSim pooled", our defaults, which multiply the posteriors
 of the ten; and methods that simulate for one observation, with the first seed only where a
-thousand simulations take a minute, where other truths are a third as many, too. Otherwise our defaults, the average of three networks, beside
-sbi's NPE (extra ``sbi``) on the same pairs. Log-densities at one truth reward a posterior that is
-too sure, so nats over the prior and coverage over many other truths stand beside them. Writes
+thousand simulations take a minute, where other truths are a third as many, too. Otherwise our
+defaults, the average of three networks, beside sbi's NPE (extra ``sbi``) on the same pairs.
+Log-densities at one truth reward a posterior that is too sure, so nats over the prior and coverage
+over many other truths stand beside them. Writes
 result.json, table.md and a picture per problem; finished parts are kept in ``out``, so that the
 same command goes on after a break.
 """
