@@ -176,3 +176,12 @@ def test_simulations_of_another_shape_or_too_few_are_refused(network):
         trust(network, torch.zeros(2), simulate=lambda theta: theta[:, :1])
     with pytest.raises(ValueError, match="simulations"):
         trust(network, torch.zeros(2), simulate=simulate, simulations=50)
+
+
+def test_a_fit_of_a_few_pairs_is_doubted():
+    theta = PRIOR.sample((20,), generator=generator("few"))
+    net = MixtureDensityPosterior(PRIOR, 2)
+    fit(net, TensorDict({"theta": theta, "summary": simulate(theta)}, [20]), progress=False)
+    said = str(trust(net, torch.tensor([0.4, 0.8])))
+    assert "Doubt: it was fitted to 18 pairs only, too few to tell what it gets wrong." in said
+    assert "No reason to doubt" not in said
