@@ -15,6 +15,7 @@ from torchrl_bayessim.diagnosis.objective import Objective, Point
 from torchrl_bayessim.diagnosis.refit import Fit
 from torchrl_bayessim.diagnosis.varying import _cost, _widened, varying
 from torchrl_bayessim.diagnosis.whitening import Whitening
+from torchrl_bayessim.diagnosis.with_chance import explains
 
 SEGMENTS, NUMBERS, DRAWS = 5, 6, 3
 
@@ -74,6 +75,15 @@ def test_what_runs_of_the_fit_show_plainly_need_not_be_in_those_that_judge(train
     assert shown(base, of_runs(train, judged, (A, C))) is better
     first = of_runs([100, 100, 100], judge, ())  # a first effect has to show where it is judged
     assert shown(first, of_runs(train, judged, (C,))) is (judged < 1)
+
+
+@pytest.mark.parametrize(
+    ("left", "after", "instead"),
+    [(2.3, 1.2, True), (2.1, 1.9, False), (4.8, 4.5, False), (1.3, 1.1, True)],
+)
+def test_what_explains_a_variation_is_not_found_beside_it(left, after, instead):
+    before = of_runs([left] * 3, left, (A,))
+    assert explains(before, of_runs([after] * 3, after, (A, C))) is instead
 
 
 def test_a_model_without_effects_varies_in_nothing():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["with_chance"]
+__all__ = ["explains", "with_chance"]
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,14 +17,17 @@ from .loss_suspects import Suspects
 from .losses import losses
 from .lost_commands import beside_lost_commands
 from .lost_samples import beside_lost_samples
-from .model import WHITE
+from .model import WHITE, Model, judged
 from .objective import Unit
 from .preparation import Prepared
+from .refit import refit
 from .scatter import Scatter, gap_with_holds
 from .selection import Selection
 from .varying import varying, with_variation
 
 Search = Callable[..., tuple[Prepared, Selection]]
+_AGAIN = 4  # steps of fits whose noise was another
+_INSTEAD = 0.5  # share of what is left beyond noise
 _MOST = 150  # effects at their places that are searched through again
 _REST = "{}, as it seems: that explains what remains"
 
@@ -85,7 +88,8 @@ def _beside_variation(
     others = [unit for unit in selection.offered if unit.effect.group != found.group]
     known = replace(selection, offered=tuple(others))
     wider, more = search(with_variation(prepared, found), known=known, varied=True)
-    if not more.best.names > selection.best.names:
+    further = more.best.names > selection.best.names
+    if not further or explains(selection.best, _under_noise_alone(prepared, more.best)):
         rest = more.best.mean_square < WHITE
         return prepared.alarmed(_REST.format(found.what)) if rest else prepared, selection
     # what was seen of every effect where noise alone was noise
@@ -96,3 +100,23 @@ def _beside_variation(
         offered=selection.offered,
     )
     return wider, more
+
+
+def _under_noise_alone(prepared: Prepared, model: Model) -> Model:
+    """Return a model that was found beside a variation, fitted without it."""
+    train, validation = prepared.sets["train"], prepared.sets["validation"]
+    return judged(train, validation, refit(train, [model.fit.point], iterations=_AGAIN))[0]
+
+
+def explains(before: Model, after: Model) -> bool:
+    """Return whether most of what is left beyond noise is gone: what varied is explained then.
+
+    What is found in the place of a variation, and not beside it, was there to be found before, and
+    was refused: where something varies a little of everything helps.
+
+    Args:
+        before: The model beside which something varies.
+        after: With what was found, under noise alone.
+    """
+    left = before.mean_square - 1
+    return before.mean_square - after.mean_square > _INSTEAD * left

@@ -141,8 +141,8 @@ def learn_shared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> N
     summary = pairs.get(posterior.summary_key)
     with torch.autocast(summary.device.type, enabled=False):
         each = TruncatedGaussianMixture(
-            *posterior.network(summary),
-            posterior.prior.box,
+            **posterior.network(summary)._asdict(),
+            box=posterior.prior.box,
             diagonal=posterior.network.covariance == "diagonal",
             points=TRAINING_POINTS,
         ).untruncated
