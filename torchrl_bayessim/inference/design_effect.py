@@ -131,7 +131,7 @@ def widened(each: Mixture, shared: Tensor, *, bounded: bool) -> Mixture:
 
     Args:
         each: The answers, batch shape ``(n,)``.
-        shared: The share :math:`\\rho` of each parameter, shape ``(D,)``.
+        shared: The share :math:`\rho` of each parameter, shape ``(D,)``.
         bounded: As of :func:`shared_by_neighbours`.
     """
     wider = (1 + (len(each.loc) - 1) * shared.to(each.loc)).sqrt()
