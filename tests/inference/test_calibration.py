@@ -225,8 +225,8 @@ def test_a_product_of_answers_may_be_too_sure_where_each_is_not(monkeypatch):
     assert calibrate(that_says(0.9), pairs).passed
     # answers that are all the same are not taken for twenty
     assert calibrate_pooled(that_says(0.9), theta, nothing).passed
-    independent = lambda *_, **__: torch.zeros(1)
-    monkeypatch.setattr("torchrl_bayessim.inference.posterior.shared_by_rows", independent)
+    independent = lambda *_, **__: torch.ones(1).double()
+    monkeypatch.setattr("torchrl_bayessim.inference.posterior.design_effect", independent)
     pooled = calibrate_pooled(that_says(0.9), theta, nothing)
     # of twenty answers the variance is 1 / (1 + 20 (1 / 0.81 - 1))
     assert pooled.coverage(0.9)["joint"] == pytest.approx(0.51, abs=0.13)

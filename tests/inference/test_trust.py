@@ -185,3 +185,5 @@ def test_a_fit_of_a_few_pairs_is_doubted():
     said = str(trust(net, torch.tensor([0.4, 0.8])))
     assert "Doubt: it was fitted to 18 pairs only, too few to tell what it gets wrong." in said
     assert "No reason to doubt" not in said
+    with_pairs = TensorDict({"theta": theta, "summary": simulate(theta, "held out")}, [20])
+    assert "too few to tell" not in str(trust(net, torch.tensor([0.4, 0.8]), held_out=with_pairs))

@@ -88,10 +88,12 @@ def _beside_variation(
     others = [unit for unit in selection.offered if unit.effect.group != found.group]
     known = replace(selection, offered=tuple(others))
     wider, more = search(with_variation(prepared, found), known=known, varied=True)
-    further = more.best.names > selection.best.names
-    if not further or explains(selection.best, _under_noise_alone(prepared, more.best)):
+    if not more.best.names > selection.best.names:
         rest = more.best.mean_square < WHITE
         return prepared.alarmed(_REST.format(found.what)) if rest else prepared, selection
+    refused = any(more.best.names <= model.names for model in selection.tried)
+    if refused and explains(selection.best, _under_noise_alone(prepared, more.best)):
+        return prepared, selection
     # what was seen of every effect where noise alone was noise
     more = replace(
         more,
@@ -111,8 +113,8 @@ def _under_noise_alone(prepared: Prepared, model: Model) -> Model:
 def explains(before: Model, after: Model) -> bool:
     """Return whether most of what is left beyond noise is gone: what varied is explained then.
 
-    What is found in the place of a variation, and not beside it, was there to be found before, and
-    was refused: where something varies a little of everything helps.
+    What is found in the place of a variation, and not beside it, and was refused without it, is not
+    to be had by it: where something varies a little of everything helps.
 
     Args:
         before: The model beside which something varies.

@@ -82,7 +82,6 @@ def descend(
         posterior.network.widening.fill_(1.0)
         posterior.network.contrast.fill_(1.0)
         posterior.network.apart.fill_(1.0)
-        posterior.network.shared.fill_(0.0)
         posterior.network.tails = posterior.network.tails.new_zeros(0)
     networks = as_one([posterior.network for posterior in posteriors])
     device = posteriors[0].network.shift.device.type

@@ -8,8 +8,9 @@ variance (the intraclass correlation), n are worth
 .. math::
     \frac{n}{1 + (n - 1) \rho}
 
-independent ones; the denominator is the design effect (Kish, 1965, *Survey Sampling*, section 5.4).
-Here the observations are the answers' scores
+independent ones; the denominator is the design effect (Kish, 1965, *Survey Sampling*, section 5.4;
+of answers that are unlike sure, n is their effective number, :math:`(\sum \Lambda)^2 / \sum
+\Lambda^2` of their precisions, section 11.2). Here the observations are the answers' scores
 
 .. math::
     s = \frac{\partial}{\partial \theta} \log \frac{q(\theta \mid x)}{p(\theta)} .
@@ -18,7 +19,8 @@ At the true parameters those of a right posterior have mean 0 over trajectories,
 parameters are; what is not 0 on average is the network's. So each answer is made wider in every
 parameter by the root of the design effect before they are multiplied.
 
-Two lower bounds of :math:`\rho` need no further simulations, and the larger one is taken:
+Two estimates of :math:`\rho` need no further simulations; each errs to the side of too little, and
+the larger one is taken:
 
 * **Neighbours** of a fit: pairs of nearly the same parameters have scores at their own parameters
   that are nearly those of two trajectories of one system.
@@ -29,17 +31,40 @@ Two lower bounds of :math:`\rho` need no further simulations, and the larger one
 
 from __future__ import annotations
 
-__all__ = ["shared_by_neighbours", "shared_by_rows", "widened"]
+__all__ = ["design_effect", "shared_by_neighbours", "shared_by_rows", "widened"]
 
 import torch
 from scipy.stats import chi2
 from torch import Tensor
 
-from .mixtures import Mixture, moment_match
+from .mixtures import Mixture, component_log_prob, moment_match
 
 _NEIGHBOURS = 3
 _FARTHEST = 3.0  # deviations, beyond which a score says no more
 _SURE = 0.05  # chance of rows that share nothing to lie so close together
+_PLACES = 64  # where rows may agree, that are tried
+_LOCAL = 2.0  # deviations within which a component belongs to a mode
+
+
+def design_effect(each: Mixture, shared: Tensor, *, bounded: bool) -> Tensor:
+    """Return how many times less n answers say together than n that share nothing, ``(D,)``.
+
+    Parameters that answers cannot tell apart get one effect: a ridge that was made wider in one of
+    two parameters alone would turn, and lie elsewhere.
+
+    Args:
+        each: The answers, whatever a box cuts off, batch shape ``(n,)``.
+        shared: What a fit has found, :func:`shared_by_neighbours`, shape ``(D,)``.
+        bounded: Whether the prior is a box (constant in these coordinates) or N(0, I).
+    """
+    if len(each.loc) < 2:
+        return torch.ones_like(each.loc[0, 0])
+    precision, pull, covariance = _gaussians(each, bounded=bounded)
+    share = torch.maximum(shared.to(each.loc), _by_rows(precision, pull))
+    deviation = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    alike = (covariance / (deviation.unsqueeze(-1) * deviation.unsqueeze(-2))).square().mean(0)
+    share = (alike * share).amax(-1)
+    return 1 + (_effective(precision) - 1) * share
 
 
 def shared_by_neighbours(each: Mixture, z: Tensor, *, bounded: bool) -> Tensor:
@@ -61,7 +86,7 @@ def shared_by_neighbours(each: Mixture, z: Tensor, *, bounded: bool) -> Tensor:
         >>> answers = lambda loc: Mixture(0 * loc, loc[:, None], scale)
         >>> own = shared_by_neighbours(answers(z + noise.sum(0)), z, bounded=True)
         >>> common = shared_by_neighbours(answers(z + noise[0] + 0.7), z, bounded=True)
-        >>> own.item() < 0.1, 0.4 < common.item() < 0.6
+        >>> own.item() < 0.1, 0.3 < common.item() < 0.6
         (True, True)
     """
     if len(z) < 2:
@@ -69,8 +94,10 @@ def shared_by_neighbours(each: Mixture, z: Tensor, *, bounded: bool) -> Tensor:
     score = _score(each, z, bounded=bounded).clamp(-_FARTHEST, _FARTHEST)
     apart = torch.cdist(z, z).fill_diagonal_(torch.inf)
     near = apart.topk(min(_NEIGHBOURS, len(z) - 1), largest=False).indices
-    common = (score.unsqueeze(1) * score[near]).mean((0, 1))
-    return (common / score.square().mean(0).clamp_min(1e-12)).clamp(0.0, 1.0)
+    common = (score.unsqueeze(1) * score[near]).mean(1)
+    chance = common.std(0) * (2 / len(z)) ** 0.5  # each pair counts as a neighbour, too
+    share = (common.mean(0) - chance) / score.square().mean(0).clamp_min(1e-12)
+    return share.clamp(0.0, 1.0)
 
 
 def _score(mixture: Mixture, z: Tensor, *, bounded: bool) -> Tensor:
@@ -89,13 +116,19 @@ def _score(mixture: Mixture, z: Tensor, *, bounded: bool) -> Tensor:
 def shared_by_rows(each: Mixture, *, bounded: bool) -> Tensor:
     r"""Return the least share that answers to n trajectories of one system have in common.
 
-    In Gaussian terms, with :math:`\Lambda_i` and :math:`\mu_i` of each answer, scores at one point
-    have the variance :math:`(1 - \rho) \bar\Lambda` over trajectories. It is the least :math:`\rho`
-    that :math:`(n - 1) V / (1 - \rho) \bar\Lambda \sim \chi^2_{n-1}` allows at 5 %.
+    In Gaussian terms, with the precision :math:`\Lambda_i` and the mean of each likelihood, and
+    their mean m by precision: scores at m have squares that sum to
+
+    .. math::
+        (1 - \rho) \Big(\sum_i \Lambda_i - \sum_i \Lambda_i (\sum_j \Lambda_j)^{-1}
+        \Lambda_i\Big)
+
+    on average (Cochran, 1954, Biometrics 10). It is the least :math:`\rho` that a chi-squared
+    distribution of as many degrees as there are effective answers but one allows at 5 %.
 
     Args:
-        each: The answers, batch shape ``(n,)``.
-        bounded: As of :func:`shared_by_neighbours`.
+        each: The answers, whatever a box cuts off, batch shape ``(n,)``.
+        bounded: As of :func:`design_effect`.
 
     Returns:
         One share in ``[0, 1]`` for each parameter, shape ``(D,)``.
@@ -109,39 +142,80 @@ def shared_by_rows(each: Mixture, *, bounded: bool) -> Tensor:
         >>> shared_by_rows(answers(x / 10), bounded=True).item() > 0.9
         True
     """
-    mean, covariance = moment_match(each)
-    n, size = mean.shape
-    if n < 2:
-        return mean.new_zeros(size)
-    precision = torch.linalg.inv(covariance)
-    middle = torch.linalg.solve(precision.sum(0), (precision @ mean.unsqueeze(-1)).sum(0))
-    score = (precision @ (mean.unsqueeze(-1) - middle)).squeeze(-1)
-    claimed = precision.diagonal(dim1=-2, dim2=-1).mean(0) - (0.0 if bounded else 1.0)
-    most = (n - 1) * score.var(0) / float(chi2.ppf(_SURE, n - 1))
-    share = (1 - most / claimed.clamp_min(1e-12)).clamp(0.0, 1.0)
-    return torch.where(claimed > 0, share, torch.zeros_like(share))
+    if len(each.loc) < 2:
+        return torch.zeros_like(each.loc[0, 0])
+    precision, pull, _ = _gaussians(each, bounded=bounded)
+    return _by_rows(precision, pull)
 
 
-def widened(each: Mixture, shared: Tensor, *, bounded: bool) -> Mixture:
+def _by_rows(precision: Tensor, pull: Tensor) -> Tensor:
+    total = precision.sum(0)
+    inverse = torch.linalg.pinv(total, hermitian=True)
+    middle = inverse @ pull.sum(0)
+    score = (pull - precision @ middle).squeeze(-1)
+    expected = (total - (precision @ inverse @ precision).sum(0)).diagonal()
+    degrees = (_effective(precision) - 1).clamp_min(1e-6)
+    least = torch.as_tensor(chi2.ppf(_SURE, degrees.cpu().numpy())).to(degrees)
+    most = score.square().sum(0) / expected.clamp_min(1e-12) * degrees / least.clamp_min(1e-300)
+    return torch.where(expected > 1e-12, (1 - most).clamp(0.0, 1.0), torch.zeros_like(most))
+
+
+def _effective(precision: Tensor) -> Tensor:
+    """Return how many answers of one precision say as much about each parameter, ``(D,)``."""
+    own = precision.diagonal(dim1=-2, dim2=-1).clamp_min(0.0)
+    return (own.sum(0).square() / own.square().sum(0).clamp_min(1e-300)).clamp_min(1.0)
+
+
+def _gaussians(each: Mixture, *, bounded: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Return each likelihood's precision, precision times mean, and each answer's covariance.
+
+    Of an answer with several modes, that of the mode where all answers together are likeliest.
+    """
+    at = _agreed(each)
+    far = component_log_prob(at, each.loc, each.scale_tril) - component_log_prob(
+        each.loc, each.loc.unsqueeze(-2), each.scale_tril.unsqueeze(-3)
+    ).squeeze(-1)
+    local = each._replace(logits=each.logits + far / _LOCAL**2)
+    mean, covariance = moment_match(local)
+    precision = torch.linalg.pinv(covariance, hermitian=True)
+    pull = precision @ mean.unsqueeze(-1)
+    if not bounded:
+        precision = precision - torch.eye(precision.shape[-1]).to(precision)
+    return precision, pull, covariance
+
+
+def _agreed(each: Mixture) -> Tensor:
+    """Return where all answers together are likeliest, of their components' means, ``(D,)``."""
+    means = each.loc.flatten(0, 1)
+    places = means[:: max(1, len(means) // _PLACES)]
+    apart = component_log_prob(places[:, None], each.loc, each.scale_tril)
+    together = (each.logits.log_softmax(-1) + apart).logsumexp(-1).sum(-1)
+    return places[together.argmax()]
+
+
+def widened(each: Mixture, effect: Tensor, *, bounded: bool) -> Mixture:
     r"""Return answers to n trajectories of which the product is as sure as they are together.
 
     The likelihood of each component, :math:`N(\mu, \Lambda^{-1}) / p`, is made wider by the root of
-    the design effect: :math:`\Lambda \to F \Lambda F` with :math:`F = \operatorname{diag}(1 + (n -
-    1) \rho)^{-1/2}`, for a Gaussian prior :math:`I - F^2 + F \Lambda F`.
+    the design effect: :math:`\Lambda \to F \Lambda F` with :math:`F =
+    \operatorname{diag}(\text{effect})^{-1/2}`; under a Gaussian prior this is done to
+    :math:`\Lambda - I`, and the likelihood stays where it is.
 
     Args:
         each: The answers, batch shape ``(n,)``.
-        shared: The share :math:`\rho` of each parameter, shape ``(D,)``.
-        bounded: As of :func:`shared_by_neighbours`.
+        effect: Of :func:`design_effect`, shape ``(D,)``.
+        bounded: As of :func:`design_effect`.
     """
-    wider = (1 + (len(each.loc) - 1) * shared.to(each.loc)).sqrt()
-    if (wider == 1).all():
+    if (effect == 1).all():
         return each
-    scale = wider.unsqueeze(-1) * each.scale_tril
+    narrower = effect.rsqrt()
     if bounded:
-        return each._replace(scale_tril=scale)
-    precision = torch.cholesky_inverse(scale)
-    pull = precision @ each.loc.unsqueeze(-1)
-    total = precision + torch.diag(1 - wider.pow(-2))
-    loc = torch.linalg.solve(total, pull).squeeze(-1)
+        return each._replace(scale_tril=each.scale_tril / narrower.unsqueeze(-1))
+    identity = torch.eye(each.loc.shape[-1]).to(each.loc)
+    precision = torch.cholesky_inverse(each.scale_tril)
+    said = precision - identity
+    centre = torch.linalg.pinv(said, hermitian=True) @ precision @ each.loc.unsqueeze(-1)
+    less = narrower.unsqueeze(-1) * said * narrower
+    total = identity + less
+    loc = torch.linalg.solve(total, less @ centre).squeeze(-1)
     return Mixture(each.logits, loc, torch.linalg.cholesky(torch.linalg.inv(total)))

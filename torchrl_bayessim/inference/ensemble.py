@@ -181,4 +181,4 @@ def real_summaries(observed: Any) -> Tensor:
                 hint="drop the trajectories that diverged, or repair their logs",
             )
         )
-    return observed
+    return observed if observed.is_floating_point() else observed.to(torch.get_default_dtype())

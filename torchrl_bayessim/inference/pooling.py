@@ -26,15 +26,15 @@ MAX_COMPONENTS = 24
 
 
 def pool(
-    each: TruncatedGaussianMixture, *, bounded: bool, shared: Tensor | None = None
+    each: TruncatedGaussianMixture, *, bounded: bool, effect: Tensor | None = None
 ) -> TruncatedGaussianMixture:
     """Return the pooled posterior of a batch ``(n,)`` of posteriors, in standardised coordinates.
 
     Args:
         each: One mixture per trajectory, batch shape ``(n,)``.
         bounded: Whether the prior is a box (constant in these coordinates) or N(0, I).
-        shared: Of what each leaves open in every parameter, the share that all leave open
-            together, shape ``(D,)``; default none of it.
+        effect: How many times less they say together in each parameter than if they shared no
+            error, shape ``(D,)``; default 1.
 
     Example:
         >>> each = TruncatedGaussianMixture(torch.zeros(4, 1), torch.zeros(4, 1, 1),
@@ -45,8 +45,9 @@ def pool(
     parts = (each.loc, each.logits, each.scale_tril)
     keys = torch.cat([part.flatten(1) for part in parts], -1).tolist()
     order = sorted(range(len(keys)), key=keys.__getitem__)
-    none = each.loc.new_zeros(each.loc.shape[-1])
-    answers = widened(each.untruncated, none if shared is None else shared, bounded=bounded)
+    answers = each.untruncated
+    if effect is not None:
+        answers = widened(answers, effect, bounded=bounded)
     factors = [Mixture(*(part[i] for part in answers)) for i in order]
     product = factors[0]
     identity = torch.eye(each.loc.shape[-1]).to(each.loc)

@@ -31,7 +31,7 @@ from torch import Tensor
 from ..counts import check_count
 from ..errors import message
 from ..kinds import check_choice, check_kind, real_numbers
-from .design_effect import shared_by_rows
+from .design_effect import design_effect
 from .features import Features, FourierFeatures, NeuralFeatures, ResidualFeatures
 from .misspecification import doubts
 from .mixtures import Mixture
@@ -245,10 +245,8 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
             summaries = summaries.mean(0, keepdim=True)
         each = self.distribution(summaries).mixture
         bounded = self.prior.box is not None
-        shared = torch.maximum(
-            self.network.shared.to(each.loc), shared_by_rows(each.untruncated, bounded=bounded)
-        )
-        found = PhysicsPosterior(pool(each, bounded=bounded, shared=shared), self.prior)
+        effect = design_effect(each.untruncated, self.network.shared, bounded=bounded)
+        found = PhysicsPosterior(pool(each, bounded=bounded, effect=effect), self.prior)
         if check and self.seen is not None:
             for doubt in doubts(self.seen.to(summaries), summaries, found):
                 warnings.warn(doubt, stacklevel=3)  # past the decorator

@@ -215,7 +215,7 @@ def reported(
         held_out: As of :func:`trust`.
         seed: Of the calibration.
     """
-    if network.seen is not None and len(network.seen) < _FEWEST:
+    if held_out is None and network.seen is not None and len(network.seen) < _FEWEST:
         few = (
             f"it was fitted to {len(network.seen)} pairs only, too few to tell what it gets wrong."
         )
