@@ -51,6 +51,7 @@ class PosteriorRefinement:
             :func:`.proposals.focus`.
         predictive: Further simulations, each time that :meth:`refine` has conditioned, which tell
             whether the posterior gives the real summary: at least 99; 0 for no such check.
+            :meth:`learn`, which does not simulate, has none.
         prior_share: Share of prior draws where importance weights are used; bounds them by its
             inverse.
         seed: Same seed, same refinements.
@@ -143,7 +144,8 @@ class PosteriorRefinement:
 
         Args:
             simulate: Parameters ``(N, D)`` to summaries ``(N, L)``.
-            observed: The real summary, shape ``(L,)``.
+            observed: The real summary, shape ``(L,)``, or those of n independent trajectories,
+                shape ``(n, L)``.
             key: What this refinement is: same key, same parameters are drawn.
             progress: Whether the fits show progress bars, where ``fit_options`` do not say.
 
