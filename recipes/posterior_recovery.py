@@ -11,9 +11,8 @@ of the ten; and methods that simulate for one observation, with the first seed o
 thousand simulations take a minute, where other truths are a third as many, too. Otherwise our
 defaults, the average of three networks, beside sbi's NPE (extra ``sbi``) on the same pairs.
 Log-densities at one truth reward a posterior that is too sure, so nats over the prior and coverage
-over many other truths stand beside them. Writes
-result.json, table.md and a picture per problem; finished parts are kept in ``out``, so that the
-same command goes on after a break.
+over many other truths stand beside them. Writes result.json, table.md and a picture per problem;
+finished parts are kept in ``out``, so that the same command goes on after a break.
 """
 
 from __future__ import annotations
@@ -189,10 +188,9 @@ def answered(settings: Recovery, name: str, seed: int) -> dict[str, Any]:
     x = lab(theta)[:, 0]
     seconds = time.perf_counter() - start
     truth = torch.tensor([[problem.truth[n] for n in prior.names]])
-    # the last row is the truth of the table
-    # in paper_mode each takes ten trajectories
-    few = settings.paper_mode and problem.costly
+    few = settings.paper_mode and problem.costly  # each takes ten trajectories there
     others = max(1, settings.truths // 3) if few else settings.truths
+    # the last row is the truth of the table
     tests = torch.cat([draw(prior, others, key=(seed, "truths")), truth])
     observed = lab(tests, real=True)
     found: dict[str, Any] = {}

@@ -55,7 +55,7 @@ ENTRIES = {
     ),
     "MixtureDensityPosterior.distribution": Entry(
         lambda **given: posterior().distribution(**given),
-        lambda: {"summary": torch.zeros(2, 1)},
+        lambda: {"summary": torch.zeros(2, 1), "points": 8},
     ),
     "PosteriorRefinement": Entry(
         package.PosteriorRefinement,

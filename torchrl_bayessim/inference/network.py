@@ -31,6 +31,7 @@ WIDEST = 4.0  # of a component, in prior deviations: nearly flat over a box, whi
 STEEPEST = 100.0  # ratio of a marginal to a conditional deviation
 LINEAR = 3.0  # deviations within which compression changes little
 _FARTHEST = 1e6  # deviations of an input: one far out says no more than that
+_OF_BEFORE = {"contrast": 1.0, "apart": 1.0, "shared": 0.0}  # what saved networks without do
 _WIDER = 0.2  # weight of the wider of two components that stand for one
 FLOOR = 1e-8  # of a variance, in standardised coordinates: a deviation of 1e-4 prior deviations
 
@@ -129,10 +130,8 @@ class MixtureDensityNetwork(nn.Module):
         if widening is not None:
             if not widening.ndim:  # of before: one factor for all parameters
                 widening = state_dict[f"{prefix}widening"] = widening.expand_as(self.widening)
-            # of before: none
-            for name in ("contrast", "apart"):
-                state_dict.setdefault(f"{prefix}{name}", torch.ones_like(widening))
-            state_dict.setdefault(f"{prefix}shared", torch.zeros_like(widening))
+            for name, value in _OF_BEFORE.items():
+                state_dict.setdefault(f"{prefix}{name}", torch.full_like(widening, value))
             tails = state_dict.setdefault(f"{prefix}tails", widening.new_zeros(0))
             self.tails = self.tails.new_zeros(len(tails))
         super()._load_from_state_dict(state_dict, prefix, *rest)
@@ -140,11 +139,9 @@ class MixtureDensityNetwork(nn.Module):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take a pickled network; those of before lack some of its scales and shares."""
         super().__setstate__(state)
-        for name in ("contrast", "apart"):
+        for name, value in _OF_BEFORE.items():
             if name not in self._buffers:
-                self.register_buffer(name, torch.ones_like(self.widening))
-        if "shared" not in self._buffers:
-            self.register_buffer("shared", torch.zeros_like(self.widening))
+                self.register_buffer(name, torch.full_like(self.widening, value))
         if "tails" not in self._buffers:
             self.register_buffer("tails", self.widening.new_zeros(0))
 

@@ -182,15 +182,20 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         """The network from summaries to mixture parameters."""
         return self.module[0].module  # pyright: ignore[reportReturnType]
 
-    def distribution(self, summary: Tensor) -> PhysicsPosterior:
-        """Return one posterior per summary, for summaries ``(*, L)``."""
+    def distribution(self, summary: Tensor, *, points: int = POINTS) -> PhysicsPosterior:
+        """Return one posterior per summary, for summaries ``(*, L)``.
+
+        ``points`` integrate the mass of a correlated component inside a box.
+        """
         check_kind("summaries of shape (*, L), a tensor", summary, Tensor)
+        check_count("points", points)
         if not summary.is_floating_point():
             raise TypeError(message("summaries of floats", str(summary.dtype)))
         return _distribution(
             **self.network(summary)._asdict(),
             prior=self.prior,
             diagonal=self.network.covariance == "diagonal",
+            points=points,
         )
 
     @torch.no_grad()

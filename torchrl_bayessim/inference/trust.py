@@ -226,8 +226,9 @@ def reported(
         calibration = calibrate(network, pairs, seed=seed)
         found = [*found, *calibration.doubts()]
     told = identifiability(posterior, prior=prior)
-    doubted = tuple(found)
-    return Trust(posterior, doubted, told, calibration, predictive=None, trajectories=trajectories)
+    return Trust(
+        posterior, tuple(found), told, calibration, predictive=None, trajectories=trajectories
+    )
 
 
 def _with_pooled(

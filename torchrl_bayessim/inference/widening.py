@@ -140,12 +140,7 @@ def learn_shared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> N
     """
     summary = pairs.get(posterior.summary_key)
     with torch.autocast(summary.device.type, enabled=False):
-        each = TruncatedGaussianMixture(
-            **posterior.network(summary)._asdict(),
-            box=posterior.prior.box,
-            diagonal=posterior.network.covariance == "diagonal",
-            points=TRAINING_POINTS,
-        ).untruncated
+        each = posterior.distribution(summary, points=TRAINING_POINTS).mixture.untruncated
     z = posterior.prior.standardize(pairs.get(posterior.theta_key)).to(each.loc)
     bounded = posterior.prior.box is not None
     posterior.network.shared.copy_(shared_by_neighbours(each, z, bounded=bounded))
