@@ -26,6 +26,7 @@ from .truncation import TruncatedGaussianMixture
 from .widening import average
 
 _MODES = 3.0  # deviations apart
+_LITTLE = 1 / 3  # deviation of what says little, in those of the prior
 
 
 class AveragedPosterior:
@@ -34,7 +35,7 @@ class AveragedPosterior:
     Where they were fitted together their means lie as far apart as held-out pairs like best: see
     :mod:`.widening`. Those pairs say nothing of answers that were multiplied, over several
     trajectories. The average of these errs less than each of them, too, and is as wide as they lie
-    apart: their means come half of the way together, unless they are modes.
+    apart: their means come half of the way together, unless they are modes, or know little.
 
     Args:
         networks: One or more, over one prior and of the same keys, fitted by
@@ -124,16 +125,18 @@ class AveragedPosterior:
 def _of_products(members: Sequence[TruncatedGaussianMixture]) -> Tensor:
     r"""Return which share of the way to the average of means products keep, ``(D,)``.
 
-    Half, and all of it where components lie far more than 3 of their deviations from the average:
-    these are modes, and a mean between them says nothing of their places,
+    Half. All of it where components lie far more than 3 of their deviations from the average: these
+    are modes, and a mean between them says nothing of their places. And all of it where they are
+    wider than a third of the prior: what lies apart there is chance, and the only sign of how
+    little is known. With w the variance within components (that of the prior is 1) and b between
+    them,
 
     .. math::
-        1 - \frac{1/2}{1 + (b / 9 w)^2}
-
-    with w the variance within components and b between them.
+        1 - \frac{\max(1 - 9 w, 0)}{2 (1 + (b / 9 w)^2)} .
     """
     every = average(members)
     _, covariance = moment_match(Mixture(every.logits, every.loc, every.scale_tril))
     within = every.logits.softmax(-1) @ every.scale_tril.square().sum(-1)
     between = covariance.diagonal() - within
-    return 1 - 0.5 / (1 + (between / (_MODES**2 * within)).square())
+    modes = (between / (_MODES**2 * within)).square()
+    return 1 - 0.5 * (1 - within / _LITTLE**2).clamp_min(0.0) / (1 + modes)
