@@ -146,6 +146,7 @@ def cartpole(run, tmp_path_factory):
     return json.loads((folder / "result.json").read_text()), folder
 
 
+@pytest.mark.slow
 def test_a_policy_of_cartpole_is_the_best_of_its_looks(cartpole):
     import robustness
     import robustness_study
@@ -205,6 +206,7 @@ def test_a_short_run_says_that_its_policies_are_the_last(finished):
     assert "policies are each the last" in (finished / "table.md").read_text()
 
 
+@pytest.mark.slow
 def test_a_table_says_what_its_intervals_leave_out(finished, cartpole):
     runs = json.loads((finished / "result.json").read_text())["runs"]
     shares = [entry[where] for entry in runs for where in ("at_real", "under_prior")]
@@ -445,6 +447,7 @@ def test_a_file_without_scores_is_refused(damage, finished, run, tmp_path, capsy
     assert "expected the scores of a policy" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_first_seeds_policies_are_filmed(cartpole, moves):
     result, folder = cartpole
     for entry in result["runs"]:

@@ -111,7 +111,12 @@ def wrapped(kind):
     return TransformedEnv(batched(2, physical, **options), DomainRandomizer(Uniform()))
 
 
-@pytest.fixture(params=["single", "nested", "unwrapped", "serial", "parallel"])
+@pytest.fixture(
+    params=[
+        *("single", "nested", "unwrapped", "serial"),
+        pytest.param("parallel", marks=pytest.mark.slow),
+    ]
+)
 def env(request):
     env = wrapped(request.param)
     yield env

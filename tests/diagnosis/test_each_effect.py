@@ -22,6 +22,7 @@ def benchmark(monkeypatch):
     return each_effect
 
 
+@pytest.mark.slow
 def test_what_was_put_on_is_found_or_said_not_to_show(benchmark, capsys):
     benchmark.main("hopper=0", "cartpole=0", "percent=20")
     *lines, total = map(json.loads, capsys.readouterr().out.splitlines())

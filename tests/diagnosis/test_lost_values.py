@@ -81,7 +81,7 @@ def test_lost_commands_are_found_beside_a_drive_that_saturates():
     assert report.gap.with_effects < 1.3
 
 
-@pytest.mark.parametrize("share", [0.02, 0.1])
+@pytest.mark.parametrize("share", [0.02, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_rare_losses_of_commands_are_counted(share):
     act = rough(share, np.random.default_rng(1))
     report = diagnose(system(), None, logs(8, act=act), effects=SOME)
@@ -93,7 +93,7 @@ def test_rare_losses_of_commands_are_counted(share):
     assert explained(report) > 0.5
 
 
-@pytest.mark.parametrize("share", [0.1, 0.3])
+@pytest.mark.parametrize("share", [pytest.param(0.1, marks=pytest.mark.slow), 0.3])
 def test_frequent_losses_of_commands_are_counted_though_not_all_patterns_are_tried(share):
     report = diagnose(
         system(), None, logs(8, act=rough(share, np.random.default_rng(1))), effects=SOME

@@ -31,8 +31,15 @@ def banded(*, damped, held):
     return {"act": act, "push": push, "xml": SERVO}
 
 
-@pytest.mark.parametrize("held", [False, True])
-@pytest.mark.parametrize("damped", [True, False])
+@pytest.mark.parametrize(
+    ("damped", "held"),
+    [
+        pytest.param(True, True, marks=pytest.mark.slow),
+        (True, False),
+        (False, True),
+        pytest.param(False, False, marks=pytest.mark.slow),
+    ],
+)
 def test_the_dead_band_of_a_servo_is_told_from_friction(damped, held):
     report = diagnose(
         system(SERVO),
