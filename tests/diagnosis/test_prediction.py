@@ -1,5 +1,7 @@
 """The batched replay of a diagnosis and the drop-in transform give the same trajectories."""
 
+import copy
+
 import mujoco
 import numpy as np
 import pytest
@@ -124,6 +126,24 @@ def test_replay_does_what_the_transform_does_on_hopper(name):
     start = torch.tensor([0.0, 1.25, 0.0, -0.1, -0.1, 0.1], dtype=torch.float64)
     log = recorded(task, (unit.effect, {unit.where: 0.1 * unit.high}), start)
     assert worst(task, log, unit, 0.1 * unit.high) < 1e-4
+
+
+@pytest.mark.parametrize("name", ["Hopper-v5", "HalfCheetah-v5"])
+def test_looking_for_islands_of_one_tree_changes_no_bit(name):
+    """As `Predictor` does not."""
+    model = known_task(name).model
+    without = copy.copy(model)
+    without.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
+    ends = []
+    for one in (model, without):
+        data = mujoco.MjData(one)
+        rng = np.random.default_rng(0)
+        for _ in range(300):
+            data.ctrl[:] = rng.uniform(-1, 1, one.nu)
+            mujoco.mj_step(one, data, 4)
+        ends.append(np.r_[data.qpos, data.qvel])
+    assert data.ncon > 0
+    np.testing.assert_array_equal(*ends)
 
 
 def test_contacts_of_named_pairs_alone_are_seen():
