@@ -12,8 +12,7 @@ GAIN, PAYLOAD, DRAG, OFFSET = (Unit(name) for name in ("gain", "payload", "drag"
 def test_what_was_as_good_alone_is_tried_beside_the_others_from_its_own_parameters(
     monkeypatch, deviance, count
 ):
-    monkeypatch.setattr(alternatives, "refit", lambda _, starts, *, race: starts)
-    monkeypatch.setattr(alternatives, "judged", lambda *found: found[-1])
+    monkeypatch.setattr(alternatives, "judged_fits", lambda *given, race: given[-1])
     best = plain({GAIN: -0.5, OFFSET: 0.1}, 320.0)
     tried = [
         plain({}, 17_000.0),

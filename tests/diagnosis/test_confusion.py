@@ -121,9 +121,8 @@ def test_rivals_of_the_others_stand_beside_what_comes_to_the_front(monkeypatch):
         selection(old), alternatives={"sensor_delay": (front,), "com_shift": (rival, worse)}
     )
     monkeypatch.setattr(confusion, "parts", lambda *_: [])
-    monkeypatch.setattr(confusion, "refit", lambda _, starts: starts)
     fitted = lambda *_: [pair(1.0, **{u.name: s for u, s in p.strengths.items()}) for p in _[-1]]
-    monkeypatch.setattr(confusion, "judged", fitted)
+    monkeypatch.setattr(confusion, "judged_fits", fitted)
     found = settled(found, "sensor_delay", dict.fromkeys(("train", "validation")))
     assert found.best is front
     (beside,) = found.alternatives["com_shift"]

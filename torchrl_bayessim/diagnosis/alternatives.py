@@ -25,7 +25,7 @@ from .model import (
     best_by_effect,
     criterion,
     gain,
-    judged,
+    judged_fits,
     needed,
     numbers,
 )
@@ -69,7 +69,7 @@ def alternatives(
         kept = {u: s for u, s in best.fit.point.strengths.items() if u.name != name}
         known = [m for m in tried if stands_in(m, kept, name)]
         if kept:
-            base = judged(train, validation, refit(train, [Point(best.fit.point.z, kept)]))[0]
+            base = judged_fits(train, validation, [Point(best.fit.point.z, kept)])[0]
             left = [u for u in units if u not in kept and u.name != name]
             strongest, most = compare(train, base.fit, left).seen.best(1.0), _RIVALS
         else:  # the search has tried those that stand out; what acts alike is a rival anyway
@@ -153,7 +153,7 @@ def _sliding(
     starts = [Point(centre, {**kept, unit: unit.inside(strength)}) for strength in ends]
     wide = refit(sets[0].differing(WIDE), starts, race=best.fit.cost)
     nearest = min(wide, key=lambda fit: fit.cost).point
-    return judged(*sets, refit(sets[0], [nearest]))
+    return judged_fits(*sets, [nearest])
 
 
 def _sticking(
@@ -169,7 +169,7 @@ def _sticking(
         return []
     more = {unit: unit.inside(_LITTLE * unit.high) for unit in dry}
     start = Point(best.fit.point.z, {**best.fit.point.strengths, **more})
-    return judged(*sets, refit(sets[0], [start]))
+    return judged_fits(*sets, [start])
 
 
 def _nearer(
@@ -212,7 +212,7 @@ def _with_each(base: Model, additions: Iterable[Mapping[Unit, float]]) -> list[P
 
 def _raced(sets: tuple[Objective, Objective], starts: Sequence[Point], best: Model) -> list[Model]:
     """Fit what can come near the best model's cost."""
-    return judged(*sets, refit(sets[0], starts, race=best.fit.cost)) if starts else []
+    return judged_fits(*sets, starts, race=best.fit.cost) if starts else []
 
 
 def exchanged(best: Model, others: Mapping[str, Sequence[Model]]) -> Model:

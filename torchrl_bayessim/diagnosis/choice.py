@@ -7,9 +7,18 @@ __all__ = ["chosen", "fewest"]
 from collections.abc import Callable, Mapping, Sequence
 
 from .form_fit import bendable, fitted_numbers, priced, with_fitted_forms
-from .model import WHITE, Model, as_good, best_by_effect, criterion, gain, judged, needed, shown
+from .model import (
+    WHITE,
+    Model,
+    as_good,
+    best_by_effect,
+    criterion,
+    gain,
+    judged_fits,
+    needed,
+    shown,
+)
 from .objective import Objective, Point, Unit
-from .refit import refit
 
 _FORMS = 3  # effects that are tried in other forms in one round
 _EQUAL = 0.1  # of the deviance
@@ -116,7 +125,7 @@ def _in_other_forms(
     plain = [m for name, m in kinds.items() if name in bends]
     plain = plain[:_FORMS]
     softer = [point for m in plain for point in _as_offered(train, m, m.beyond(base), laws)]
-    plain += judged(*sets, refit(train, softer, iterations=4)) if softer else []
+    plain += judged_fits(*sets, softer, iterations=4) if softer else []
     return {m: with_fitted_forms(*sets, m, offered) for m in plain}
 
 

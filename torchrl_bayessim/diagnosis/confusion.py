@@ -12,9 +12,8 @@ from ..effects.effect import Effect
 from ..effects.transmission import ServoDeadBand
 from .alternatives import kind, leaves_less_to_do
 from .elimination import parts, without_idle
-from .model import Model, as_good, criterion, judged
+from .model import Model, as_good, criterion, judged_fits
 from .objective import Objective, Point
-from .refit import refit
 from .selection import Selection
 
 _SAME = 2.0  # of a deviance: what fits of one and the same law may differ by
@@ -215,4 +214,4 @@ def _beside(
         starts.append(Point(rival.fit.point.z, {**new, **added}))
     if not starts:
         return ()
-    return tuple(judged(sets["train"], sets["validation"], refit(sets["train"], starts)))
+    return tuple(judged_fits(sets["train"], sets["validation"], starts))

@@ -14,10 +14,9 @@ from ..effects.joints import Armature, CoulombFriction
 from ..effects.robot import Robot
 from ..effects.transmission import servo_damping
 from .cells import plain
-from .model import Model, as_good, judged
+from .model import Model, as_good, judged_fits
 from .objective import Point, Unit
 from .preparation import Prepared
-from .refit import refit
 from .report import Finding
 
 _EDGE = 0.98  # of the largest strength that is looked for
@@ -74,7 +73,7 @@ def unsigned(best: Model, prepared: Prepared) -> list[str]:
     signed = [unit for unit in best.units if unit.low < 0 and point.strengths[unit]]
     others = [Point(point.z, {**point.strengths, u: -point.strengths[u]}) for u in signed]
     train, validation = prepared.sets["train"], prepared.sets["validation"]
-    mirrored = judged(train, validation, refit(train, others, iterations=0))
+    mirrored = judged_fits(train, validation, others, iterations=0)
     sizes = [abs(unit.actual(point.strengths[unit])) for unit in signed]
     return [
         f"{plain(unit.name)} at {unit.where} is {size:.3g} or {-size:.3g} "

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from .form_fit import bendable, priced, with_forms_anew
-from .model import Model, as_good, criterion, judged, shown
+from .model import Model, as_good, criterion, judged, judged_fits, shown
 from .objective import Objective, Point, Unit
 from .refit import refit
 
@@ -114,7 +114,7 @@ def parts(
         for out in dict.fromkeys(unit.name for unit in strengths)
     ]
     starts = [Point(model.fit.point.z, left) for left in without if of(left)]
-    return judged(train, validation, refit(train, starts))
+    return judged_fits(train, validation, starts)
 
 
 def without_stopgaps(

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ..effects.effect import Reach
 from ..effects.units import slides
-from .model import LIKELY, WHITE, Model, criterion, judged, numbers, price
+from .model import LIKELY, WHITE, Model, criterion, judged, judged_fits, numbers, price
 from .objective import Objective, Point, Unit
 from .refit import Fit, outrun, refit, with_prior
 
@@ -138,7 +138,7 @@ def with_forms_anew(
     if not shifts:
         return bent
     changes = [_nearest_offered(shift, offered) - _value(shift) for shift in shifts]
-    (straight,) = judged(*sets, refit(train, [_with(model.fit.point, shifts, changes)]))
+    (straight,) = judged_fits(*sets, [_with(model.fit.point, shifts, changes)])
     straight = with_fitted_forms(*sets, straight, offered, race=race)
     return straight if straight.fit.cost < bent.fit.cost + price(model) else bent
 

@@ -11,6 +11,7 @@ __all__ = [
     "criterion",
     "gain",
     "judged",
+    "judged_fits",
     "needed",
     "numbers",
     "price",
@@ -19,13 +20,14 @@ __all__ = [
 
 from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from .objective import Objective, Unit
-from .refit import Fit
+from .objective import Objective, Point, Unit
+from .refit import Fit, refit
 
 Array = NDArray[np.float64]
 LIKELY = 6.0  # a deviance that chance often makes
@@ -83,6 +85,16 @@ def judged(train: Objective, validation: Objective, fits: Sequence[Fit]) -> list
     first = 1 + int(train.segments.log.max())
     logs = np.r_[train.segments.log, first + validation.segments.log]
     return [Model(fit, innovations, logs) for fit, innovations in zip(fits, held_out, strict=True)]
+
+
+def judged_fits(
+    train: Objective,
+    validation: Objective,
+    starts: Sequence[Point] | Sequence[Fit],
+    **options: Any,
+) -> list[Model]:
+    """Return what `refit` finds from each start, with innovations on the validation segments."""
+    return judged(train, validation, refit(train, starts, **options))
 
 
 def criterion(model: Model, dispersion: float) -> float:

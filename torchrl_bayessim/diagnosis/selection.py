@@ -25,9 +25,9 @@ from .elimination import eliminated, without_stopgaps
 from .explanations import bent, compare, explanations
 from .form_fit import with_fitted_forms, with_forms_anew
 from .further_effects import identified, no_rival, nothing_left, stands_apart
-from .model import LIKELY, WHITE, Model, judged
+from .model import LIKELY, WHITE, Model, judged, judged_fits
 from .objective import Objective, Point, Unit
-from .refit import Fit, refit
+from .refit import Fit
 from .screening import Screen
 from .shapes import with_shapes
 from .wavering import waver
@@ -228,7 +228,7 @@ def _anew(train: Objective, validation: Objective, known: Selection) -> list[Mod
         if model.units:
             each.setdefault(frozenset(model.units), model)
     points = [model.fit.point for model in each.values()]
-    return judged(train, validation, refit(train, points, iterations=_AGAIN))
+    return judged_fits(train, validation, points, iterations=_AGAIN)
 
 
 def _settled(
@@ -290,7 +290,7 @@ def _exactly(train: Objective, validation: Objective, model: Model) -> Model:
     substeps = next(near, own)
     for predictor in {train.predictor, validation.predictor}:
         predictor.exactly(substeps)
-    return judged(train, validation, refit(train, [model.fit.point], iterations=4))[0]
+    return judged_fits(train, validation, [model.fit.point], iterations=4)[0]
 
 
 def _p_value(seen: Screen, model: Model, generator: np.random.Generator) -> float:

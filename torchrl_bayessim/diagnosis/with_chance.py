@@ -17,10 +17,9 @@ from .loss_suspects import Suspects
 from .losses import losses
 from .lost_commands import beside_lost_commands
 from .lost_samples import beside_lost_samples
-from .model import WHITE, Model, judged
+from .model import WHITE, Model, judged_fits
 from .objective import Unit
 from .preparation import Prepared
-from .refit import refit
 from .scatter import Scatter, gap_with_holds
 from .selection import Selection
 from .varying import varying, with_variation
@@ -107,7 +106,7 @@ def _beside_variation(
 def _under_noise_alone(prepared: Prepared, model: Model) -> Model:
     """Return a model that was found beside a variation, fitted without it."""
     train, validation = prepared.sets["train"], prepared.sets["validation"]
-    return judged(train, validation, refit(train, [model.fit.point], iterations=_AGAIN))[0]
+    return judged_fits(train, validation, [model.fit.point], iterations=_AGAIN)[0]
 
 
 def explains(before: Model, after: Model) -> bool:
