@@ -81,7 +81,7 @@ def few_tables(monkeypatch):
     monkeypatch.setattr(episode_draws, "_TABLES", 8)
 
 
-@pytest.mark.parametrize("make", [cartpole, hopper])
+@pytest.mark.parametrize("make", [cartpole, pytest.param(hopper, marks=pytest.mark.slow)])
 def test_episodes_leave_nothing_behind(make):
     held, traced, whole, episodes = growth(make)
     assert episodes > 1_000

@@ -148,10 +148,13 @@ def test_what_is_unusual_is_taken_without_a_word(change, spoilt):
     assert json.loads((folder / "new/report.json").read_text())["verdict"] == "none"
 
 
-SOME = ("YAML tag apply", "a pipe")
+SOME = {"YAML tag apply": [pytest.mark.slow], "a pipe": []}
 
 
-@pytest.mark.parametrize("case", [c for c in CASES if c.name in SOME], ids=lambda case: case.name)
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(c, marks=SOME[c.name], id=c.name) for c in CASES if c.name in SOME],
+)
 def test_the_same_from_a_shell(case: Case, spoilt):
     folder = spoilt(case)
     before = contents(folder.parent)

@@ -122,6 +122,7 @@ def test_a_gap_that_nothing_explains_is_not_called_none():
     assert "It is real, but none of the 2 effects" in str(report)
 
 
+@pytest.mark.slow
 def test_a_smaller_cause_is_named_beside_a_larger_one():
     """A hundredth of what the spring explains, and 25 times the noise."""
     data = logs(push=lambda q, v: -0.2 * np.tanh(v / 0.01) - 1.5 * q)

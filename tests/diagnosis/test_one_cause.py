@@ -58,6 +58,7 @@ def test_an_alarm_tells_both_ends_of_the_curve():
     assert dry_friction_alarms(found((FIRST, FIRST)), {}, ROBOT) == []
 
 
+@pytest.mark.slow
 def test_friction_that_fades_to_some_is_named_once_and_simulated_with_both_laws():
     push = lambda q, v: -(0.15 + 0.4 * np.exp(-((v / 0.8) ** 2))) * np.tanh(v / 0.01)
     effects = (*LAWS, "viscous_friction", "quadratic_drag", "dead_band")
