@@ -112,6 +112,9 @@ def fit_together(
 ) -> list[FitReport]:
     """Fit networks whose answers are averaged: one split, and as wide as their average needs.
 
+    To be asked of one trajectory: of several, :func:`fit_apart` is right, since what an average
+    needs of single ones says nothing of products.
+
     Args:
         networks: Changed in place.
         pairs: ``{"theta", "summary"[, "weight"]}``, batch size ``[N]``.
