@@ -46,6 +46,7 @@ from torch import Tensor
 from workers import workers
 
 from torchrl_bayessim import plots
+from torchrl_bayessim.counts import check_count
 from torchrl_bayessim.errors import message
 from torchrl_bayessim.inference.ensemble import NETWORKS
 from torchrl_bayessim.inference.identifiability import identifiability
@@ -85,6 +86,7 @@ def job(settings: Recovery, out: Path) -> dict[str, Any]:
         )
         settings.npe = False
     names = chosen(settings.problem)
+    check_count("seeds", settings.seeds)
     if settings.npe and find_spec("sbi") is None:
         settings.npe = False
         print("sbi is not installed (extra sbi): its NPE and SMC-ABC are left out")
@@ -116,7 +118,7 @@ def job(settings: Recovery, out: Path) -> dict[str, Any]:
 
 def chosen(problem: str) -> list[str]:
     """Return the problems to run, of ``"all"`` or names with commas; says which cannot be."""
-    names = list(PROBLEMS) if problem == "all" else problem.split(",")
+    names = list(PROBLEMS) if problem == "all" else list(dict.fromkeys(problem.split(",")))
     for name in names:
         if name not in PROBLEMS:
             raise ValueError(message("a problem", name, available=[*PROBLEMS, "all"]))

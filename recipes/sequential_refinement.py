@@ -5,7 +5,7 @@
 One robot after another with parameters drawn from the prior, and one trajectory or a few of each,
 as `posterior_recovery` has them. A single round simulates from the prior and answers for all robots
 at once. Sequential inference simulates for one robot: in a smaller box around its posterior of the
-round before, and learns from the pairs of all rounds in it. Both are the average of two networks.
+round before, and learns from the pairs of all rounds in it. Both average as many networks.
 Writes result.json, table.md and nats.png, the log-density of all parameters at the truth over the
 prior's against the number of simulations; finished parts are kept in ``out``.
 """
@@ -30,6 +30,7 @@ from workers import workers
 
 from torchrl_bayessim import plots
 from torchrl_bayessim.errors import message
+from torchrl_bayessim.inference.ensemble import NETWORKS
 from torchrl_bayessim.inference.sequential import sequential
 from torchrl_bayessim.sources import draw
 from torchrl_bayessim.whole_file import write_text
@@ -132,7 +133,7 @@ def all_at_once(settings: Refinement, name: str) -> list[list[float]]:
     columns = []
     for end in range(size, len(theta) + 1, size):
         answer, _ = bayessim(
-            prior, theta[:end], x[:end], networks=2, pool=False, seed=settings.seed
+            prior, theta[:end], x[:end], networks=NETWORKS, pool=False, seed=settings.seed
         )
         log_prob = answer(truth, observed[:, None]).joint
         assert log_prob is not None  # of networks it is there

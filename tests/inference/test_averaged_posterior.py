@@ -2,11 +2,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_bayessim.inference.averaged_posterior import AveragedPosterior
+from torchrl_bayessim.inference.averaged_posterior import AveragedPosterior, _of_products
 from torchrl_bayessim.inference.calibration import calibrate
 from torchrl_bayessim.inference.ensemble import fit_apart, fit_together
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.inference.truncation import TruncatedGaussianMixture
+from torchrl_bayessim.inference.widening import average
 
 PRIOR = BoxPrior({"mass": (2.0, 6.0)})
 
@@ -60,6 +62,20 @@ def test_means_of_products_come_half_of_the_way_together():
     share = torch.cat([moved[: len(one.loc)] / way, moved[len(one.loc) :] / -way])
     assert (share > 0.4).all()
     assert (share <= 0.5 + 1e-6).all()
+
+
+def test_products_that_lie_apart_along_a_ridge_stay_on_it():
+    along, across = torch.tensor([1.0, 0.3]).double(), torch.tensor([-0.3, 1.0]).double()
+    along, across = along / along.norm(), across / across.norm()
+    covariance = 0.45**2 * torch.outer(along, along) + 0.01**2 * torch.outer(across, across)
+    scale = torch.linalg.cholesky(covariance)[None]
+    box = torch.full((2,), -(3**0.5)).double(), torch.full((2,), 3**0.5).double()
+    members = [
+        TruncatedGaussianMixture(torch.zeros(1).double(), at * along[None], scale, box)
+        for at in (-0.5, 0.0, 0.5)
+    ]
+    together = average(members, _of_products(members))
+    assert ((together.loc @ across).abs() < 0.3 * 0.01).all()
 
 
 def test_modes_of_products_stay_where_they_are():

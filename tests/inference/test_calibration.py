@@ -231,7 +231,7 @@ def test_a_product_of_answers_may_be_too_sure_where_each_is_not(monkeypatch):
     # of twenty answers the variance is 1 / (1 + 20 (1 / 0.81 - 1))
     assert pooled.coverage(0.9)["joint"] == pytest.approx(0.51, abs=0.13)
     assert not pooled.passed
-    assert "the answer is too sure: of 60 known" in pooled.doubts(what="the answer")[0]
+    assert "the answer is too sure, or biased: of 60 known" in pooled.doubts(what="the answer")[0]
 
 
 def test_groups_of_another_number_are_refused():

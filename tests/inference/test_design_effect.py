@@ -46,7 +46,7 @@ def erring(share, count=1000, *, key=0):
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.8])
 def test_neighbours_tell_the_share_of_the_error_that_they_have_in_common(share):
     found = [
-        shared_by_neighbours(each.untruncated, z, bounded=True).item()
+        shared_by_neighbours(each.untruncated, z, bounded=True)[0].item()
         for z, each in (erring(share, key=key) for key in range(5))
     ]
     assert sum(found) / 5 == pytest.approx(share, abs=0.06)
@@ -58,10 +58,9 @@ def test_under_a_gaussian_prior_what_the_prior_pulls_is_no_error():
     exact = 1 / (1 + noise**-2)
     x = z + noise * randn(1500, 1, key="noise")
     each = answers(exact * x / noise**2, exact**0.5)
-    assert shared_by_neighbours(each.untruncated, z, bounded=False).item() < 0.06
-    assert (
-        shared_by_neighbours(each.untruncated, z, bounded=True).item() > 0.2
-    )  # without the prior's score
+    assert shared_by_neighbours(each.untruncated, z, bounded=False)[0].item() < 0.06
+    without = shared_by_neighbours(each.untruncated, z, bounded=True)  # the prior's score
+    assert max(share.item() for share in without) > 0.2
 
 
 @pytest.mark.parametrize("n", [2, 5, 20])
@@ -111,7 +110,8 @@ def test_a_product_is_as_sure_as_the_design_effect_says(bounded):
     pooled = pool(each, bounded=bounded, effect=torch.tensor([n / worth]).double())
     expected = worth * noise**-2 + (0 if bounded else 1)
     assert pooled.scale_tril.item() == pytest.approx(expected**-0.5)
-    assert pooled.loc.item() == pytest.approx(worth * x.mean().item() * noise**-2 / expected)
+    there = worth * x.mean().item() * noise**-2 / expected
+    assert pooled.loc.item() == pytest.approx(there, rel=2e-5)
 
 
 def test_parameters_share_errors_each_by_its_own():
@@ -173,7 +173,7 @@ def test_what_only_one_parameter_of_a_ridge_shares_does_not_turn_the_ridge(corre
 
 
 def test_under_a_gaussian_prior_likelihoods_stay_where_they_are():
-    said = torch.tensor([[5.0, 3.5], [3.5, 4.0]]).double()
+    said = 10 * torch.tensor([[5.0, 3.5], [3.5, 4.0]]).double()
     centre = torch.tensor([[1.5], [-1.0]]).double()
     total = said + torch.eye(2)
     loc = torch.linalg.solve(total, said @ centre).mT
@@ -184,7 +184,56 @@ def test_under_a_gaussian_prior_likelihoods_stay_where_they_are():
     less = precision - torch.eye(2)
     half = torch.tensor([1.0, 0.5])
     torch.testing.assert_close(less, half[:, None] * said * half)
-    torch.testing.assert_close(torch.linalg.solve(less, precision @ wider.loc[0].mT), centre)
+    found = torch.linalg.solve(less, precision @ wider.loc[0].mT)
+    torch.testing.assert_close(found, centre, atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("strong", [2.0, 100.0])
+@pytest.mark.parametrize("weak", [0.02, 1e-4, -1e-3, -0.5])
+def test_a_direction_that_an_answer_says_nothing_of_moves_no_other(strong, weak):
+    """Under a Gaussian prior its likelihood lies anywhere there, at a pull over nearly nothing."""
+    turn = torch.tensor([[1.0, 1.0], [1.0, -1.0]]).double() / 2**0.5
+    said = turn @ torch.diag(torch.tensor([strong, weak]).double()) @ turn.mT
+    scale = torch.linalg.cholesky(torch.linalg.inv(said + torch.eye(2)))
+    measured, noise = 0.3 * randn(10, key="strong"), torch.full((10,), 0.05).double()
+    loc = (turn @ torch.stack([measured, noise])).mT
+    each = Mixture(torch.zeros(10, 1).double(), loc[:, None], scale.expand(10, 1, 2, 2))
+    wider = widened(each, torch.tensor([2.0, 2.4]).double(), bounded=False)
+    assert ((wider.loc[:, 0] @ turn)[:, 1].abs() < 0.5).all()
+    precision = torch.cholesky_inverse(wider.scale_tril[:, 0])
+    assert (torch.linalg.eigvalsh(precision) > 1 - 1e-9).all()  # nothing wider than the prior
+    less = torch.linalg.solve(
+        (said / 2.2 + torch.eye(2)), said / 2.2 @ (turn @ torch.stack([measured, 0 * measured]))
+    )
+    moved = (wider.loc[:, 0] - less.mT) @ turn[:, 0] * (1 + strong) ** 0.5
+    assert (moved.abs() < 0.5).all()  # of deviations; tens if it were not so
+
+
+def test_errors_near_the_edges_of_a_box_are_no_matter_in_its_middle():
+    """As of networks whose means stay in the box."""
+    z = 3**0.5 * (2 * torch.rand(3000, 1, generator=generator("box")).double() - 1)
+    x = z + 0.3 * randn(3000, 1, key="in the box")
+    each = answers(x.clamp(-1.3, 1.3), 0.3)
+    middle, edges = shared_by_neighbours(each.untruncated, z, bounded=True)
+    assert middle.item() < 0.02
+    assert edges.item() > 0.4
+    for at, share in ((0.2, 0.0), (1.5, edges.item())):
+        rows = answers(at + 0.3 * randn(40, 1, key=("rows", 3)), 0.3).untruncated
+        effect = design_effect(rows, middle, at_edges=edges, bounded=True)
+        assert effect.item() == pytest.approx(1 + 39 * share, rel=0.1)
+
+
+def test_a_fit_under_a_box_sharpens_with_the_root_of_the_trajectories():
+    prior, noise = BoxPrior({"a": (0.0, 1.0)}), 0.3
+    theta = prior.sample((5000,), generator=generator("theta"))
+    x = prior.standardize(theta) + noise * randn(5000, 1, key="x").float()
+    network = MixtureDensityPosterior(prior, 1, seed=0)
+    pairs = TensorDict({"theta": theta, "summary": x}, [5000])
+    fit_apart([network], pairs, seeds=[0], epochs=25, progress=False)
+    rows = 0.2 + noise * randn(64, 1, key="many").float()
+    for n in (4, 16, 64):
+        found = network.condition(rows[:n], check=False).stddev / prior.stddev
+        assert found.item() == pytest.approx(noise * n**-0.5, rel=0.2)
 
 
 def test_a_truth_far_from_the_middle_of_a_gaussian_prior_hides_nothing_that_rows_share():
@@ -226,7 +275,7 @@ def test_trajectories_together_invent_nothing_of_a_parameter_that_does_nothing(p
     rows = prior.standardize(truth)[:, :1] + 0.3 * randn(n, 4, key=n).float()
     posterior = together.condition(rows, check=False)
     one = together.condition(rows[:1], check=False)
-    assert posterior.stddev[1] > 0.8 * prior.stddev[1]
+    assert posterior.stddev[1] > 0.75 * prior.stddev[1]
     assert posterior.stddev[0] < 0.8 * one.stddev[0]  # what is measured is known better
     if prior.box is not None:
         plain = pool(networks[0].distribution(rows).mixture, bounded=True)

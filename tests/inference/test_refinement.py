@@ -89,6 +89,23 @@ def test_a_report_on_several_trajectories_says_that_their_answer_together_was_no
     assert "calibration of 3 together" in str(made.trust)
 
 
+@pytest.mark.filterwarnings("ignore:the answer for 5 trajectories together")
+def test_answers_for_several_trajectories_are_checked_at_known_parameters_where_asked():
+    rows = noisy(BOX, 7)(torch.tensor([[0.4, 2.0]]).expand(5, -1))
+    made, asked = PosteriorRefinement(BOX, simulations=300, truths=60, fit_options=QUICK), []
+    simulate = noisy(BOX)
+    made.refine(lambda theta: asked.append(len(theta)) or simulate(theta), rows, key=(0,))
+    assert asked == [300, 60 * 5]
+    assert made.trust.pooled is not None
+    assert len(made.trust.pooled.rank) == 60
+    assert "calibration of 5 together" not in str(made.trust)
+    assert made.settings["truths"] == 60
+    made.refine(simulate, rows[0], key=(1,))
+    assert made.trust.pooled is None
+    with pytest.raises(ValueError, match="50"):
+        PosteriorRefinement(BOX, truths=20)
+
+
 def test_too_few_simulations_for_a_predictive_check_are_refused():
     with pytest.raises(ValueError, match="99"):
         PosteriorRefinement(BOX, predictive=50)

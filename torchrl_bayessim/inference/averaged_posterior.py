@@ -132,11 +132,18 @@ def _of_products(members: Sequence[TruncatedGaussianMixture]) -> Tensor:
     them,
 
     .. math::
-        1 - \frac{\max(1 - 9 w, 0)}{2 (1 + (b / 9 w)^2)} .
+        1 - \frac{\max(1 - 9 w, 0)}{2 (1 + (b / (9 w))^2)} .
+
+    Parameters that components cannot tell apart keep what the one of them keeps that keeps most:
+    means that lie apart along a ridge stay on it.
     """
     every = average(members)
     _, covariance = moment_match(Mixture(every.logits, every.loc, every.scale_tril))
-    within = every.logits.softmax(-1) @ every.scale_tril.square().sum(-1)
+    inside = every.scale_tril @ every.scale_tril.mT
+    inside = torch.einsum("k,kij->ij", every.logits.softmax(-1), inside)
+    within = inside.diagonal()
     between = covariance.diagonal() - within
     modes = (between / (_MODES**2 * within)).square()
-    return 1 - 0.5 * (1 - within / _LITTLE**2).clamp_min(0.0) / (1 + modes)
+    kept = 1 - 0.5 * (1 - within / _LITTLE**2).clamp_min(0.0) / (1 + modes)
+    alike = inside.square() / (within.unsqueeze(-1) * within)
+    return (alike * kept).amax(-1)

@@ -71,7 +71,9 @@ class Calibration:
         """Return a Kolmogorov-Smirnov p-value per share: small ones say that it is not uniform."""
         columns = {f"rank of {n}": self.rank[:, d] for d, n in enumerate(self.names)}
         columns |= {"density": self.density, "distance": self.distance}
-        return {name: float(kstest(u.numpy(), "uniform").pvalue) for name, u in columns.items()}
+        return {
+            name: float(kstest(u.cpu().numpy(), "uniform").pvalue) for name, u in columns.items()
+        }
 
     @property
     def passed(self) -> bool:
@@ -85,7 +87,7 @@ class Calibration:
             return []
         inner, outer = (self.coverage(level) for level in (0.5, 0.9))
         worst = min(self.p_values().items(), key=lambda item: item[1])
-        sure = "too sure" if outer["joint"] < 0.9 else "not sure enough, or biased"
+        sure = "too sure, or biased" if outer["joint"] < 0.9 else "not sure enough, or biased"
         return [
             f"{what} is {sure}: of {len(self.rank)} known truths its 50 % and 90 % regions "
             f"hold {inner['joint']:.0%} and {outer['joint']:.0%} ({worst[0]}: p = {worst[1]:.1g}). "
@@ -141,6 +143,7 @@ def calibrate_draws(
         )
     theta, draws = theta.double(), draws.double()
     jitter = torch.rand(3, len(theta), 1, generator=generator(seed, "ties"), dtype=theta.dtype)
+    jitter = jitter.to(theta.device)
     own, away = _distances(theta, draws, generator(seed, "points"))
     at_truth, at_draws = log_prob
     return Calibration(
@@ -174,7 +177,7 @@ def _distances(theta: Tensor, draws: Tensor, g: torch.Generator) -> tuple[Tensor
     """
     pooled = torch.cat([theta.unsqueeze(0), draws])
     scale = pooled.flatten(0, 1).std(0).clamp_min(1e-12)
-    push = torch.randn(theta.shape, generator=g, dtype=theta.dtype)
+    push = torch.randn(theta.shape, generator=g, dtype=theta.dtype).to(theta.device)
     points = pooled.mean(0) + 0.5 * (pooled.std(0) + 0.1 * scale) * push
     away = ((pooled - points) / scale).norm(dim=-1)
     return away[0], away[1:]

@@ -23,7 +23,8 @@ Two estimates of :math:`\rho` need no further simulations; each errs to the side
 the larger one is taken:
 
 * **Neighbours** of a fit: pairs of nearly the same parameters have scores at their own parameters
-  that are nearly those of two trajectories of one system.
+  that are nearly those of two trajectories of one system. Where a prior is a box, means do not
+  leave it, and answers near its edges share more: it is estimated there and elsewhere.
 * **Rows**: answers to the n real trajectories scatter by what differs between these. Answers that
   lie much closer together than each of them is wide leave the rest open together; where a parameter
   does nothing, they leave all of it.
@@ -42,11 +43,16 @@ from .mixtures import Mixture, component_log_prob, moment_match
 _NEIGHBOURS = 3
 _FARTHEST = 3.0  # deviations, beyond which a score says no more
 _SURE = 0.05  # chance of rows that share nothing to lie so close together
+_EDGE = 1.0  # prior deviations from an edge within which answers share more
+_FAINT = 0.1  # precision, in units of the prior's, of what says too little to have a place
+_NOTHING = 0.01  # the same, of what may be nothing
 _PLACES = 64  # where rows may agree, that are tried
 _LOCAL = 2.0  # deviations within which a component belongs to a mode
 
 
-def design_effect(each: Mixture, shared: Tensor, *, bounded: bool) -> Tensor:
+def design_effect(
+    each: Mixture, shared: Tensor, *, bounded: bool, at_edges: Tensor | None = None
+) -> Tensor:
     """Return how many times less n answers say together than n that share nothing, ``(D,)``.
 
     Parameters that answers cannot tell apart get one effect: a ridge that was made wider in one of
@@ -56,18 +62,24 @@ def design_effect(each: Mixture, shared: Tensor, *, bounded: bool) -> Tensor:
         each: The answers, whatever a box cuts off, batch shape ``(n,)``.
         shared: What a fit has found, :func:`shared_by_neighbours`, shape ``(D,)``.
         bounded: Whether the prior is a box (constant in these coordinates) or N(0, I).
+        at_edges: What it has found where the answers are near an edge of the box; default the same.
     """
     if len(each.loc) < 2:
         return torch.ones_like(each.loc[0, 0])
-    precision, pull, covariance = _gaussians(each, bounded=bounded)
-    share = torch.maximum(shared.to(each.loc), _by_rows(precision, pull))
+    at = _agreed(each)
+    precision, pull, covariance = _gaussians(each, at, bounded=bounded)
+    shared = shared.to(each.loc)
+    if bounded and at_edges is not None:
+        near = (2 - 2 * _from_edges(at) / _EDGE).clamp(0.0, 1.0)
+        shared = shared + near * (at_edges.to(each.loc) - shared)
+    share = torch.maximum(shared, _by_rows(precision, pull))
     deviation = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     alike = (covariance / (deviation.unsqueeze(-1) * deviation.unsqueeze(-2))).square().mean(0)
     share = (alike * share).amax(-1)
     return 1 + (_effective(precision) - 1) * share
 
 
-def shared_by_neighbours(each: Mixture, z: Tensor, *, bounded: bool) -> Tensor:
+def shared_by_neighbours(each: Mixture, z: Tensor, *, bounded: bool) -> tuple[Tensor, Tensor]:
     """Return the share of the scores' mean square that pairs of near parameters have in common.
 
     Args:
@@ -76,7 +88,8 @@ def shared_by_neighbours(each: Mixture, z: Tensor, *, bounded: bool) -> Tensor:
         bounded: Whether the prior is a box (constant in these coordinates) or N(0, I).
 
     Returns:
-        One share in ``[0, 1]`` for each parameter, shape ``(D,)``.
+        One share in ``[0, 1]`` for each parameter, shape ``(D,)``; and those near edges of a box,
+        where there are any.
 
     Example:
         >>> z = torch.linspace(-1, 1, 200, dtype=torch.float64)[:, None]
@@ -84,20 +97,40 @@ def shared_by_neighbours(each: Mixture, z: Tensor, *, bounded: bool) -> Tensor:
         >>> noise = torch.randn(2, 200, 1, generator=g, dtype=torch.float64) / 2**0.5
         >>> scale = torch.ones(200, 1, 1, 1, dtype=torch.float64)
         >>> answers = lambda loc: Mixture(0 * loc, loc[:, None], scale)
-        >>> own = shared_by_neighbours(answers(z + noise.sum(0)), z, bounded=True)
-        >>> common = shared_by_neighbours(answers(z + noise[0] + 0.7), z, bounded=True)
+        >>> own, _ = shared_by_neighbours(answers(z + noise.sum(0)), z, bounded=True)
+        >>> common, _ = shared_by_neighbours(answers(z + noise[0] + 0.7), z, bounded=True)
         >>> own.item() < 0.1, 0.3 < common.item() < 0.6
         (True, True)
     """
     if len(z) < 2:
-        return z.new_zeros(z.shape[-1])
+        return z.new_zeros(z.shape[-1]), z.new_zeros(z.shape[-1])
     score = _score(each, z, bounded=bounded).clamp(-_FARTHEST, _FARTHEST)
     apart = torch.cdist(z, z).fill_diagonal_(torch.inf)
     near = apart.topk(min(_NEIGHBOURS, len(z) - 1), largest=False).indices
     common = (score.unsqueeze(1) * score[near]).mean(1)
-    chance = common.std(0) * (2 / len(z)) ** 0.5  # each pair counts as a neighbour, too
-    share = (common.mean(0) - chance) / score.square().mean(0).clamp_min(1e-12)
-    return share.clamp(0.0, 1.0)
+    if not bounded:
+        share = _share(common, score.square(), torch.ones_like(z))
+        return share, share
+    at_edges = (_from_edges(z) < _EDGE).to(z)
+    square = score.square()
+    return _share(common, square, 1 - at_edges), _share(common, square, at_edges)
+
+
+def _share(common: Tensor, square: Tensor, where: Tensor) -> Tensor:
+    """Return which share of the squares is in common, where ``where`` is 1; ``(D,)`` of ``(N, D)``.
+
+    Less what chance makes of it.
+    """
+    count = where.sum(0).clamp_min(2)
+    mean = (common * where).sum(0) / count
+    spread = (((common - mean) * where).square().sum(0) / (count - 1)).sqrt()
+    chance = spread * (2 / count).sqrt()  # each pair counts as a neighbour, too
+    return ((mean - chance) / ((square * where).sum(0) / count).clamp_min(1e-12)).clamp(0.0, 1.0)
+
+
+def _from_edges(z: Tensor) -> Tensor:
+    """Return how far values are from the nearer edge of a box, in prior deviations."""
+    return 3**0.5 - z.abs()
 
 
 def _score(mixture: Mixture, z: Tensor, *, bounded: bool) -> Tensor:
@@ -144,7 +177,7 @@ def shared_by_rows(each: Mixture, *, bounded: bool) -> Tensor:
     """
     if len(each.loc) < 2:
         return torch.zeros_like(each.loc[0, 0])
-    precision, pull, _ = _gaussians(each, bounded=bounded)
+    precision, pull, _ = _gaussians(each, _agreed(each), bounded=bounded)
     return _by_rows(precision, pull)
 
 
@@ -166,12 +199,11 @@ def _effective(precision: Tensor) -> Tensor:
     return (own.sum(0).square() / own.square().sum(0).clamp_min(1e-300)).clamp_min(1.0)
 
 
-def _gaussians(each: Mixture, *, bounded: bool) -> tuple[Tensor, Tensor, Tensor]:
+def _gaussians(each: Mixture, at: Tensor, *, bounded: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Return each likelihood's precision, precision times mean, and each answer's covariance.
 
-    Of an answer with several modes, that of the mode where all answers together are likeliest.
+    Of an answer with several modes, that of the mode at ``at``.
     """
-    at = _agreed(each)
     far = component_log_prob(at, each.loc, each.scale_tril) - component_log_prob(
         each.loc, each.loc.unsqueeze(-2), each.scale_tril.unsqueeze(-3)
     ).squeeze(-1)
@@ -180,8 +212,20 @@ def _gaussians(each: Mixture, *, bounded: bool) -> tuple[Tensor, Tensor, Tensor]
     precision = torch.linalg.pinv(covariance, hermitian=True)
     pull = precision @ mean.unsqueeze(-1)
     if not bounded:
-        precision = precision - torch.eye(precision.shape[-1]).to(precision)
+        precision, pull = _likelihoods(precision, pull)
     return precision, pull, covariance
+
+
+def _likelihoods(precision: Tensor, pull: Tensor) -> tuple[Tensor, Tensor]:
+    """Return answers under N(0, I) without it, by precision and precision times mean.
+
+    What is wider than the prior says nothing.
+    """
+    values, vectors = torch.linalg.eigh(precision - torch.eye(precision.shape[-1]).to(precision))
+    values = values.clamp_min(0.0).unsqueeze(-1)
+    said = vectors @ (values * vectors.mT)
+    something = values.square() / (values.square() + _NOTHING**2)
+    return said, vectors @ (something * (vectors.mT @ pull))
 
 
 def _agreed(each: Mixture) -> Tensor:
@@ -196,10 +240,15 @@ def _agreed(each: Mixture) -> Tensor:
 def widened(each: Mixture, effect: Tensor, *, bounded: bool) -> Mixture:
     r"""Return answers to n trajectories of which the product is as sure as they are together.
 
-    The likelihood of each component, :math:`N(\mu, \Lambda^{-1}) / p`, is made wider by the root of
-    the design effect: :math:`\Lambda \to F \Lambda F` with :math:`F =
-    \operatorname{diag}(\text{effect})^{-1/2}`; under a Gaussian prior this is done to
-    :math:`\Lambda - I`, and the likelihood stays where it is.
+    Likelihoods :math:`N(m, S^{-1})` are made wider by the root of the design effect, and stay where
+    they are: :math:`S \to F S F` with :math:`F = \operatorname{diag}(\text{effect})^{-1/2}`. Under
+    a Gaussian prior that of a component is :math:`N(\mu, \Lambda^{-1}) / N(0, I)`, with :math:`S =
+    \Lambda - I` and :math:`S m = \Lambda \mu`, and m is anywhere in directions that it says nothing
+    of. So :math:`c = S (S^2 + \epsilon^2 I)^{-1} \Lambda \mu` stays where it is, and the rest
+    becomes less by :math:`F^2`:
+
+    .. math::
+        \Lambda \mu \to F S F c + F^2 (\Lambda \mu - S c) .
 
     Args:
         each: The answers, batch shape ``(n,)``.
@@ -213,9 +262,10 @@ def widened(each: Mixture, effect: Tensor, *, bounded: bool) -> Mixture:
         return each._replace(scale_tril=each.scale_tril / narrower.unsqueeze(-1))
     identity = torch.eye(each.loc.shape[-1]).to(each.loc)
     precision = torch.cholesky_inverse(each.scale_tril)
-    said = precision - identity
-    centre = torch.linalg.pinv(said, hermitian=True) @ precision @ each.loc.unsqueeze(-1)
+    said, pull = _likelihoods(precision, precision @ each.loc.unsqueeze(-1))
+    place = said @ torch.linalg.solve(said @ said + _FAINT**2 * identity, pull)
     less = narrower.unsqueeze(-1) * said * narrower
+    rest = narrower.square().unsqueeze(-1) * (pull - said @ place)
     total = identity + less
-    loc = torch.linalg.solve(total, less @ centre).squeeze(-1)
+    loc = torch.linalg.solve(total, less @ place + rest).squeeze(-1)
     return Mixture(each.logits, loc, torch.linalg.cholesky(torch.linalg.inv(total)))

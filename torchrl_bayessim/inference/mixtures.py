@@ -247,7 +247,7 @@ def reduce(mixture: Mixture, components: int) -> Mixture:
     cost = _merge_cost(parts, parts).fill_diagonal_(torch.inf)
     while len(cost) > components:
         one, other = _nearest_pairs(cost, math.ceil((len(cost) - components) / 6))
-        rest = torch.ones(len(cost), dtype=torch.bool)
+        rest = torch.ones(len(cost), dtype=torch.bool, device=cost.device)
         rest[one] = rest[other] = False
         merged = _merge(tuple(part[one] for part in parts), tuple(part[other] for part in parts))
         parts = tuple(torch.cat([part[rest], new]) for part, new in zip(parts, merged, strict=True))
@@ -262,7 +262,7 @@ def reduce(mixture: Mixture, components: int) -> Mixture:
 def _nearest_pairs(cost: Tensor, most: int) -> tuple[Tensor, Tensor]:
     """Return pairs of which each is the other's nearest, the best of them, at least one."""
     least, nearest = cost.min(1)
-    own = torch.arange(len(cost))
+    own = torch.arange(len(cost), device=cost.device)
     first = ((nearest[nearest] == own) & (own < nearest)).nonzero()[:, 0]
     first = first[least[first].argsort()][:most]
     if not len(first):  # ties

@@ -31,7 +31,8 @@ WIDEST = 4.0  # of a component, in prior deviations: nearly flat over a box, whi
 STEEPEST = 100.0  # ratio of a marginal to a conditional deviation
 LINEAR = 3.0  # deviations within which compression changes little
 _FARTHEST = 1e6  # deviations of an input: one far out says no more than that
-_OF_BEFORE = {"contrast": 1.0, "apart": 1.0, "shared": 0.0}  # what saved networks without do
+# what saved networks without do
+_OF_BEFORE = {"contrast": 1.0, "apart": 1.0, "shared": 0.0, "shared_at_edges": 0.0}
 _WIDER = 0.2  # weight of the wider of two components that stand for one
 FLOOR = 1e-8  # of a variance, in standardised coordinates: a deviation of 1e-4 prior deviations
 
@@ -87,6 +88,7 @@ class MixtureDensityNetwork(nn.Module):
     tails: Tensor  # logarithm of the ratio of :func:`heavy_tailed`, shape (1,), or (0,) for none
     apart: Tensor  # share of its distance from the mean of an average that is left there, (D,)
     shared: Tensor  # of what answers leave open, the share that trajectories leave together, (D,)
+    shared_at_edges: Tensor  # the same near the edges of a box
 
     def __init__(
         self,
@@ -124,6 +126,7 @@ class MixtureDensityNetwork(nn.Module):
         self.register_buffer("tails", torch.zeros(0))
         self.register_buffer("apart", torch.ones(parameters))
         self.register_buffer("shared", torch.zeros(parameters))
+        self.register_buffer("shared_at_edges", torch.zeros(parameters))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         widening = state_dict.get(f"{prefix}widening")

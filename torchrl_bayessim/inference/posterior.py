@@ -250,7 +250,10 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
             summaries = summaries.mean(0, keepdim=True)
         each = self.distribution(summaries).mixture
         bounded = self.prior.box is not None
-        effect = design_effect(each.untruncated, self.network.shared, bounded=bounded)
+        network = self.network
+        effect = design_effect(
+            each.untruncated, network.shared, at_edges=network.shared_at_edges, bounded=bounded
+        )
         found = PhysicsPosterior(pool(each, bounded=bounded, effect=effect), self.prior)
         if check and self.seen is not None:
             for doubt in doubts(self.seen.to(summaries), summaries, found):

@@ -34,7 +34,7 @@ from .posterior import MixtureDensityPosterior
 from .priors import BoxPrior, Prior, check_prior
 from .proposals import focus, importance_weights
 from .truncation import TruncatedGaussianMixture
-from .trust import LEAST_SIMULATIONS, Trust, reported, with_predictive
+from .trust import FEWEST, LEAST_SIMULATIONS, Trust, reported, with_pooled, with_predictive
 
 
 class PosteriorRefinement:
@@ -52,6 +52,8 @@ class PosteriorRefinement:
         predictive: Further simulations, each time that :meth:`refine` has conditioned, which tell
             whether the posterior gives the real summary: at least 99; 0 for no such check.
             :meth:`learn`, which does not simulate, has none.
+        truths: Known parameters, each time, at which the answer for n trajectories together is
+            checked with n simulations each: at least 50; 0 for no such check, nor for one.
         prior_share: Share of prior draws where importance weights are used; bounds them by its
             inverse.
         seed: Same seed, same refinements.
@@ -91,6 +93,7 @@ class PosteriorRefinement:
         make_posterior: PosteriorMaker | None = None,
         margin: float = 1.0,
         predictive: int = 0,
+        truths: int = 0,
         prior_share: float = 0.25,
         seed: int = 0,
         fit_options: Mapping[str, Any] | None = None,
@@ -103,6 +106,8 @@ class PosteriorRefinement:
         check_prior_share(prior_share)
         if predictive != 0:
             check_count("predictive", predictive, least=LEAST_SIMULATIONS)
+        if truths != 0:
+            check_count("truths", truths, least=FEWEST)
         check_fit_options({} if fit_options is None else fit_options)
         if make_posterior is not None:
             expected = "make_posterior, a function of the prior and the summary's size"
@@ -110,7 +115,7 @@ class PosteriorRefinement:
         self.prior, self.simulations, self.networks = prior, simulations, networks
         self.make_posterior = MixtureDensityPosterior if make_posterior is None else make_posterior
         self.margin, self.prior_share, self.seed = margin, prior_share, seed
-        self.predictive = predictive
+        self.predictive, self.truths = predictive, truths
         self.fit_options = {} if fit_options is None else dict(fit_options)
         self.posterior: PhysicsPosterior | None = None
         self.network: AveragedPosterior | None = None
@@ -130,6 +135,7 @@ class PosteriorRefinement:
             "fit_options": repr({k: v for k, v in self.fit_options.items() if k != "progress"}),
             # not there in checkpoints of before
             **({"predictive": self.predictive} if self.predictive else {}),
+            **({"truths": self.truths} if self.truths else {}),
         }
 
     def refine(
@@ -159,20 +165,26 @@ class PosteriorRefinement:
         check_function("simulate, a function of parameters (N, D)", simulate)
         theta = draw(self.proposal(), self.simulations, key=(self.seed, *key, "theta"))
         report = self.learn(theta, simulate(theta), observed, key=key, progress=progress)
-        if self.predictive:
-            self._check(simulate, observed, key=key)
+        self._check(simulate, observed, key=key)
         return report
 
     def _check(
         self, simulate: Callable[[Tensor], Tensor], observed: Tensor, *, key: tuple[int | str, ...]
     ) -> None:
-        """Add to the report whether simulations at the posterior give the real summary."""
+        """Add to the report what takes simulations."""
         assert self.trust is not None
-        own = seed_from(self.seed, *key, "predictive")
-        before = self.trust.doubts
-        self.trust = with_predictive(
-            self.trust, simulate, observed, simulations=self.predictive, seed=own
-        )
+        assert self.network is not None
+        before, rows = self.trust.doubts, torch.atleast_2d(observed)
+        if self.truths and len(rows) > 1:
+            own = seed_from(self.seed, *key, "truths")
+            self.trust = with_pooled(
+                self.trust, self.network, simulate, rows, truths=self.truths, seed=own
+            )
+        if self.predictive:
+            own = seed_from(self.seed, *key, "predictive")
+            self.trust = with_predictive(
+                self.trust, simulate, observed, simulations=self.predictive, seed=own
+            )
         for doubt in self.trust.doubts[len(before) :]:
             warnings.warn(doubt, stacklevel=3)
 

@@ -15,7 +15,15 @@ needs the simulator:
 
 from __future__ import annotations
 
-__all__ = ["LEAST_SIMULATIONS", "Trust", "reported", "trust", "with_predictive"]
+__all__ = [
+    "FEWEST",
+    "LEAST_SIMULATIONS",
+    "Trust",
+    "reported",
+    "trust",
+    "with_pooled",
+    "with_predictive",
+]
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -38,7 +46,7 @@ from .physics_posterior import PhysicsPosterior
 from .posterior import MixtureDensityPosterior
 from .priors import Prior
 
-_FEWEST = 50  # pairs, below which shares say too little
+FEWEST = 50  # pairs, below which shares say too little
 _ALIKE = 20  # simulations of which the parameters are nearly the same
 _SURPRISE = 0.01  # share below which the real data are a surprise to the posterior
 LEAST_SIMULATIONS = round(1 / _SURPRISE) - 1  # that can tell such a share
@@ -74,7 +82,7 @@ class Trust:
         """What could not be looked at, in words."""
         found = []
         if self.calibration is None:
-            found.append(f"calibration, without {_FEWEST} held-out pairs of equal weight")
+            found.append(f"calibration, without {FEWEST} held-out pairs of equal weight")
         if self.trajectories > 1 and self.pooled is None:
             found.append(
                 f"calibration of {self.trajectories} together, without simulate and truths"
@@ -140,7 +148,7 @@ def trust(
     if network.seen is None:
         raise ValueError(message("a fitted network", "one that is not", hint="fit(network, pairs)"))
     if truths != 0:
-        check_count("truths", truths, least=_FEWEST)
+        check_count("truths", truths, least=FEWEST)
     rows = torch.atleast_2d(real_summaries(observed))
     posterior = network.condition(rows, check=False)
     found = doubts(network.seen, rows, posterior)
@@ -151,7 +159,7 @@ def trust(
     if simulate is None:
         return told
     if count > 1 and truths:
-        told = _with_pooled(told, network, simulate, rows, truths=truths, seed=seed)
+        told = with_pooled(told, network, simulate, rows, truths=truths, seed=seed)
     return with_predictive(told, simulate, rows, simulations=simulations, seed=seed)
 
 
@@ -188,7 +196,8 @@ def with_predictive(
         real = "summary" if len(rows) == 1 else f"{len(rows)} summaries together"
         surprise = (
             f"only {predictive:.1%} of {simulations} simulations at the posterior lie as far "
-            f"out as the real {real}: they do not reproduce the data."
+            f"out as the real {real}: they do not reproduce the data. If more simulations for the "
+            "fit change nothing, no parameter does: torchrl_bayessim.diagnosis finds what lacks."
         )
         told = replace(told, doubts=(*told.doubts, surprise))
     return replace(told, predictive=predictive)
@@ -215,14 +224,14 @@ def reported(
         held_out: As of :func:`trust`.
         seed: Of the calibration.
     """
-    if held_out is None and network.seen is not None and len(network.seen) < _FEWEST:
+    if held_out is None and network.seen is not None and len(network.seen) < FEWEST:
         few = (
             f"it was fitted to {len(network.seen)} pairs only, too few to tell what it gets wrong."
         )
         found = [*found, few]
     pairs = _unweighted(network.held_out) if held_out is None else held_out
     calibration = None
-    if pairs is not None and len(pairs) >= _FEWEST:
+    if pairs is not None and len(pairs) >= FEWEST:
         calibration = calibrate(network, pairs, seed=seed)
         found = [*found, *calibration.doubts()]
     told = identifiability(posterior, prior=prior)
@@ -231,7 +240,7 @@ def reported(
     )
 
 
-def _with_pooled(
+def with_pooled(
     told: Trust,
     network: MixtureDensityPosterior | AveragedPosterior,
     simulate: Callable[[Tensor], Tensor],
@@ -240,12 +249,21 @@ def _with_pooled(
     truths: int,
     seed: int,
 ) -> Trust:
-    """Return the report with the calibration of answers for as many rows together."""
+    """Return the report with the calibration of answers for as many trajectories together.
+
+    Args:
+        told: Without it.
+        network: As of :func:`trust`.
+        simulate: As of :func:`trust`.
+        rows: Real summaries, shape ``(n, L)``.
+        truths: As of :func:`trust`.
+        seed: Same seed, same truths.
+    """
     theta = draw(network.prior, truths, key=(seed, "truths"))
     count = len(rows)
     groups = _predicted(simulate, theta.repeat_interleave(count, 0), rows).unflatten(0, (-1, count))
     whole = groups.isfinite().flatten(1).all(-1)
-    if whole.sum() < _FEWEST:
+    if whole.sum() < FEWEST:
         return told
     pooled = calibrate_pooled(network, theta[whole], groups[whole], seed=seed)
     doubts = pooled.doubts(what=f"the answer for {count} trajectories together")

@@ -143,7 +143,9 @@ def learn_shared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> N
         each = posterior.distribution(summary, points=TRAINING_POINTS).mixture.untruncated
     z = posterior.prior.standardize(pairs.get(posterior.theta_key)).to(each.loc)
     bounded = posterior.prior.box is not None
-    posterior.network.shared.copy_(shared_by_neighbours(each, z, bounded=bounded))
+    shared, at_edges = shared_by_neighbours(each, z, bounded=bounded)
+    posterior.network.shared.copy_(shared)
+    posterior.network.shared_at_edges.copy_(at_edges)
 
 
 def _usual(size: int, *, alone: bool) -> list[float]:
