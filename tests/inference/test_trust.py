@@ -9,7 +9,7 @@ from torchrl_bayessim.inference.ensemble import fit_together
 from torchrl_bayessim.inference.fit import fit
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior
-from torchrl_bayessim.inference.trust import trust
+from torchrl_bayessim.inference.trust import contradictions, trust
 from torchrl_bayessim.randomness import generator
 
 PRIOR = BoxPrior({"mass": (0.0, 1.0), "link length 2": (0.0, 1.0)})
@@ -130,6 +130,16 @@ def test_trajectories_that_contradict_each_other_are_doubted(network, masses):
     assert found.predictive <= 0.01
     expected = f"as far out as the real {len(masses)} summaries together"
     assert any(expected in text for text in found.doubts)
+    without = str(trust(network, simulate(theta, "contradiction")))
+    assert f"the {len(masses)} trajectories contradict each other about mass. Either" in without
+    assert "torchrl_bayessim.diagnosis" in without
+
+
+def test_trajectories_of_one_robot_seldom_contradict_each_other(network):
+    truths = PRIOR.sample((60,), generator=generator("of one robot"))
+    for index, truth in enumerate(truths):
+        rows = simulate(truth.expand(2 + index % 10, 2), ("one robot", index))
+        assert contradictions(network, rows) == []
 
 
 def test_simulations_that_all_diverge_are_said_to(network):

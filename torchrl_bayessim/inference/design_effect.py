@@ -32,7 +32,13 @@ the larger one is taken:
 
 from __future__ import annotations
 
-__all__ = ["design_effect", "shared_by_neighbours", "shared_by_rows", "widened"]
+__all__ = [
+    "design_effect",
+    "dispersion",
+    "shared_by_neighbours",
+    "shared_by_rows",
+    "widened",
+]
 
 import torch
 from scipy.stats import chi2
@@ -181,16 +187,47 @@ def shared_by_rows(each: Mixture, *, bounded: bool) -> Tensor:
     return _by_rows(precision, pull)
 
 
+def dispersion(each: Mixture, *, bounded: bool) -> tuple[Tensor, Tensor]:
+    """Return how far answers to n trajectories lie apart, as a share of what they leave open.
+
+    Args:
+        each: The answers, whatever a box cuts off, batch shape ``(n,)``.
+        bounded: As of :func:`design_effect`.
+
+    Returns:
+        Cochran's statistic per degree of freedom in every parameter, ``(D,)``: near 1 where each
+        answer is as sure as it should be, and one system gave them all; and how likely as much is
+        then.
+
+    Example:
+        >>> scale = torch.ones(6, 1, 1, 1, dtype=torch.float64)
+        >>> answers = lambda loc: Mixture(0 * loc[:, None], loc[:, None, None], scale)
+        >>> apart, likely = dispersion(answers(torch.tensor([-5.0, 5, -4, 4, -3, 3]).double()),
+        ...                            bounded=True)
+        >>> round(apart.item()), likely.item() < 1e-6
+        (20, True)
+    """
+    share, degrees = _scatter(*_natural(*moment_match(each), bounded=bounded))
+    likely = chi2.sf((share * degrees).cpu().numpy(), degrees.cpu().numpy())
+    return share, torch.as_tensor(likely).to(share)
+
+
 def _by_rows(precision: Tensor, pull: Tensor) -> Tensor:
+    share, degrees = _scatter(precision, pull)
+    least = torch.as_tensor(chi2.ppf(_SURE, degrees.cpu().numpy())).to(degrees)
+    return (1 - share * degrees / least.clamp_min(1e-300)).clamp(0.0, 1.0)
+
+
+def _scatter(precision: Tensor, pull: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the scores' squares by those expected, 1 where nothing is, and their degrees."""
     total = precision.sum(0)
     inverse = torch.linalg.pinv(total, hermitian=True)
     middle = inverse @ pull.sum(0)
     score = (pull - precision @ middle).squeeze(-1)
     expected = (total - (precision @ inverse @ precision).sum(0)).diagonal()
+    share = score.square().sum(0) / expected.clamp_min(1e-12)
     degrees = (_effective(precision) - 1).clamp_min(1e-6)
-    least = torch.as_tensor(chi2.ppf(_SURE, degrees.cpu().numpy())).to(degrees)
-    most = score.square().sum(0) / expected.clamp_min(1e-12) * degrees / least.clamp_min(1e-300)
-    return torch.where(expected > 1e-12, (1 - most).clamp(0.0, 1.0), torch.zeros_like(most))
+    return torch.where(expected > 1e-12, share, torch.ones_like(share)), degrees
 
 
 def _effective(precision: Tensor) -> Tensor:
@@ -209,11 +246,14 @@ def _gaussians(each: Mixture, at: Tensor, *, bounded: bool) -> tuple[Tensor, Ten
     ).squeeze(-1)
     local = each._replace(logits=each.logits + far / _LOCAL**2)
     mean, covariance = moment_match(local)
+    return *_natural(mean, covariance, bounded=bounded), covariance
+
+
+def _natural(mean: Tensor, covariance: Tensor, *, bounded: bool) -> tuple[Tensor, Tensor]:
+    """Return the precision, and precision times mean, of likelihoods by answers' moments."""
     precision = torch.linalg.pinv(covariance, hermitian=True)
     pull = precision @ mean.unsqueeze(-1)
-    if not bounded:
-        precision, pull = _likelihoods(precision, pull)
-    return precision, pull, covariance
+    return (precision, pull) if bounded else _likelihoods(precision, pull)
 
 
 def _likelihoods(precision: Tensor, pull: Tensor) -> tuple[Tensor, Tensor]:

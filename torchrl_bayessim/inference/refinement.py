@@ -34,7 +34,15 @@ from .posterior import MixtureDensityPosterior
 from .priors import BoxPrior, Prior, check_prior
 from .proposals import focus, importance_weights
 from .truncation import TruncatedGaussianMixture
-from .trust import FEWEST, LEAST_SIMULATIONS, Trust, reported, with_pooled, with_predictive
+from .trust import (
+    FEWEST,
+    LEAST_SIMULATIONS,
+    Trust,
+    contradictions,
+    reported,
+    with_pooled,
+    with_predictive,
+)
 
 
 class PosteriorRefinement:
@@ -230,6 +238,7 @@ class PosteriorRefinement:
             fit_options={"progress": progress} | self.fit_options,
         )
         found = doubts(summary, observed, self.posterior)
+        found = [*found, *contradictions(self.network, observed)]
         for doubt in found:
             warnings.warn(doubt, stacklevel=2)
         own = seed_from(self.seed, *key, "trust")

@@ -19,6 +19,7 @@ __all__ = [
     "FEWEST",
     "LEAST_SIMULATIONS",
     "Trust",
+    "contradictions",
     "reported",
     "trust",
     "with_pooled",
@@ -39,6 +40,7 @@ from ..randomness import generator
 from ..sources import draw
 from .averaged_posterior import AveragedPosterior
 from .calibration import Calibration, calibrate, calibrate_pooled
+from .design_effect import dispersion
 from .ensemble import real_summaries
 from .identifiability import Identifiability, identifiability
 from .misspecification import doubts, strangeness
@@ -49,6 +51,7 @@ from .priors import Prior
 FEWEST = 50  # pairs, below which shares say too little
 _ALIKE = 20  # simulations of which the parameters are nearly the same
 _SURPRISE = 0.01  # share below which the real data are a surprise to the posterior
+_APART, _UNLIKELY = 2.0, 1e-4  # how far answers lie apart, and how likely: they contradict
 LEAST_SIMULATIONS = round(1 / _SURPRISE) - 1  # that can tell such a share
 
 
@@ -151,7 +154,7 @@ def trust(
         check_count("truths", truths, least=FEWEST)
     rows = torch.atleast_2d(real_summaries(observed))
     posterior = network.condition(rows, check=False)
-    found = doubts(network.seen, rows, posterior)
+    found = [*doubts(network.seen, rows, posterior), *contradictions(network, rows)]
     count = len(rows)
     told = reported(
         network, posterior, found, trajectories=count, prior=prior, held_out=held_out, seed=seed
@@ -161,6 +164,38 @@ def trust(
     if count > 1 and truths:
         told = with_pooled(told, network, simulate, rows, truths=truths, seed=seed)
     return with_predictive(told, simulate, rows, simulations=simulations, seed=seed)
+
+
+@torch.no_grad()
+def contradictions(
+    network: MixtureDensityPosterior | AveragedPosterior, observed: Tensor
+) -> list[str]:
+    """Return a sentence where answers to single trajectories lie too far apart for one system.
+
+    Twice as far as networks may be too sure of, and less likely than 1 in 10,000 of right ones: see
+    :func:`.design_effect.dispersion`.
+
+    Args:
+        network: As of :func:`trust`.
+        observed: As of :func:`trust`.
+    """
+    rows = torch.atleast_2d(observed)
+    if len(rows) < 2:
+        return []
+    each = network.distribution(rows.to(torch.get_default_dtype())).mixture.untruncated
+    apart, likely = dispersion(each, bounded=network.prior.box is not None)
+    names = [
+        name
+        for name, far, p in zip(network.prior.names, apart, likely, strict=True)
+        if far > _APART and p < _UNLIKELY
+    ]
+    if not names:
+        return []
+    return [
+        f"the {len(rows)} trajectories contradict each other about {', '.join(names)}. Either they "
+        "are of several systems, or no parameter explains them all: torchrl_bayessim.diagnosis "
+        "finds what the simulator lacks."
+    ]
 
 
 def with_predictive(
