@@ -142,6 +142,11 @@ def test_trajectories_of_one_robot_seldom_contradict_each_other(network):
         assert contradictions(network, rows) == []
 
 
+def test_truths_without_a_simulator_are_refused(network):
+    with pytest.raises(ValueError, match="simulate, for summaries at the truths"):
+        trust(network, torch.zeros(3, 2), truths=60)
+
+
 def test_simulations_that_all_diverge_are_said_to(network):
     found = trust(network, torch.tensor([0.4, 0.8]), simulate=lambda theta: theta * torch.nan)
     assert found.predictive == 0.0

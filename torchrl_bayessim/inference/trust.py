@@ -152,6 +152,8 @@ def trust(
         raise ValueError(message("a fitted network", "one that is not", hint="fit(network, pairs)"))
     if truths != 0:
         check_count("truths", truths, least=FEWEST)
+        if simulate is None:
+            raise ValueError(message("simulate, for summaries at the truths", "truths without it"))
     rows = torch.atleast_2d(real_summaries(observed))
     posterior = network.condition(rows, check=False)
     found = [*doubts(network.seen, rows, posterior), *contradictions(network, rows)]
