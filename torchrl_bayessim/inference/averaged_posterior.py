@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ..errors import message
 from ..kinds import check_kind
+from .design_effect import most_of_alike
 from .misspecification import doubts
 from .mixtures import Mixture, moment_match
 from .physics_posterior import PhysicsPosterior
@@ -138,12 +139,11 @@ def _of_products(members: Sequence[TruncatedGaussianMixture]) -> Tensor:
     means that lie apart along a ridge stay on it.
     """
     every = average(members)
-    _, covariance = moment_match(Mixture(every.logits, every.loc, every.scale_tril))
-    inside = every.scale_tril @ every.scale_tril.mT
-    inside = torch.einsum("k,kij->ij", every.logits.softmax(-1), inside)
+    mixture = Mixture(every.logits, every.loc, every.scale_tril)
+    _, covariance = moment_match(mixture)
+    inside = torch.einsum("k,kij->ij", mixture.logits.softmax(-1), mixture.covariance)
     within = inside.diagonal()
     between = covariance.diagonal() - within
     modes = (between / (_MODES**2 * within)).square()
     kept = 1 - 0.5 * (1 - within / _LITTLE**2).clamp_min(0.0) / (1 + modes)
-    alike = inside.square() / (within.unsqueeze(-1) * within)
-    return (alike * kept).amax(-1)
+    return most_of_alike(kept, inside[None])

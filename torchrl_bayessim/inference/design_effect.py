@@ -35,6 +35,7 @@ from __future__ import annotations
 __all__ = [
     "design_effect",
     "dispersion",
+    "most_of_alike",
     "shared_by_neighbours",
     "shared_by_rows",
     "widened",
@@ -78,11 +79,22 @@ def design_effect(
     if bounded and at_edges is not None:
         near = (2 - 2 * _from_edges(at) / _EDGE).clamp(0.0, 1.0)
         shared = shared + near * (at_edges.to(each.loc) - shared)
-    share = torch.maximum(shared, _by_rows(precision, pull))
+    share = most_of_alike(torch.maximum(shared, _by_rows(precision, pull)), covariance)
+    return 1 + (_effective(precision) - 1) * share
+
+
+def most_of_alike(share: Tensor, covariance: Tensor) -> Tensor:
+    """Return for each parameter the largest share of those that it cannot be told from, ``(D,)``.
+
+    Times the squares of their correlations.
+
+    Args:
+        share: Of each parameter, shape ``(D,)``.
+        covariance: Of answers, shape ``(n, D, D)``; squares are averaged over these.
+    """
     deviation = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     alike = (covariance / (deviation.unsqueeze(-1) * deviation.unsqueeze(-2))).square().mean(0)
-    share = (alike * share).amax(-1)
-    return 1 + (_effective(precision) - 1) * share
+    return (alike * share).amax(-1)
 
 
 def shared_by_neighbours(each: Mixture, z: Tensor, *, bounded: bool) -> tuple[Tensor, Tensor]:
@@ -114,11 +126,11 @@ def shared_by_neighbours(each: Mixture, z: Tensor, *, bounded: bool) -> tuple[Te
     apart = torch.cdist(z, z).fill_diagonal_(torch.inf)
     near = apart.topk(min(_NEIGHBOURS, len(z) - 1), largest=False).indices
     common = (score.unsqueeze(1) * score[near]).mean(1)
+    square = score.square()
     if not bounded:
-        share = _share(common, score.square(), torch.ones_like(z))
+        share = _share(common, square, torch.ones_like(z))
         return share, share
     at_edges = (_from_edges(z) < _EDGE).to(z)
-    square = score.square()
     return _share(common, square, 1 - at_edges), _share(common, square, at_edges)
 
 

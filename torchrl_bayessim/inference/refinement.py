@@ -237,8 +237,10 @@ class PosteriorRefinement:
             seeds=[seed_from(self.seed, *key, "fit", i) for i in range(self.networks)],
             fit_options={"progress": progress} | self.fit_options,
         )
-        found = doubts(summary, observed, self.posterior)
-        found = [*found, *contradictions(self.network, observed)]
+        found = [
+            *doubts(summary, observed, self.posterior),
+            *contradictions(self.network, observed),
+        ]
         for doubt in found:
             warnings.warn(doubt, stacklevel=2)
         own = seed_from(self.seed, *key, "trust")
