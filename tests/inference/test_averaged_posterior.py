@@ -93,7 +93,7 @@ def test_conditioning_far_from_all_simulations_warns():
         averaged.condition(torch.tensor([40.0]))
 
 
-def test_networks_must_agree_in_prior_and_keys():
+def test_networks_must_agree_in_prior_keys_and_device():
     one = MixtureDensityPosterior(PRIOR, 1)
     with pytest.raises(ValueError, match="one network or more, got 'none'"):
         AveragedPosterior([])
@@ -106,3 +106,7 @@ def test_networks_must_agree_in_prior_and_keys():
     for other in others:
         with pytest.raises(ValueError, match=r"networks over BoxPrior\(mass: \[2, 6\]\), all with"):
             AveragedPosterior([one, other])
+    with pytest.raises(
+        ValueError, match=r"networks on one device, since.*got 'cpu and meta'\. Try: network\.to"
+    ):
+        AveragedPosterior([one, MixtureDensityPosterior(PRIOR, 1).to("meta")])

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_bayessim.errors import SimulationError
-from torchrl_bayessim.inference.fit import fit, select_lengthscale
+from torchrl_bayessim.inference.fit import fit, fit_several, select_lengthscale
 from torchrl_bayessim.inference.losses import PosteriorLoss
 from torchrl_bayessim.inference.posterior import MixtureDensityPosterior
 from torchrl_bayessim.inference.priors import BoxPrior, GaussianPrior
@@ -389,6 +389,12 @@ def test_weights_are_one_for_each_pair():
 def test_rates_and_shares_are_numbers(options, error, said):
     with pytest.raises(error, match=said):
         short_fit(posterior(), linear_gaussian(20), **options)
+
+
+def test_posteriors_on_several_devices_are_refused():
+    posteriors = [posterior(), posterior().to("meta")]
+    with pytest.raises(ValueError, match=r"on one device.*got 'cpu and meta'\. Try: network\.to"):
+        fit_several(posteriors, linear_gaussian(20), seeds=[0, 1])
 
 
 def test_complex_summaries_are_refused():

@@ -21,6 +21,7 @@ from .design_effect import most_of_alike
 from .misspecification import doubts
 from .mixtures import Mixture, moment_match
 from .physics_posterior import PhysicsPosterior
+from .placement import check_one_device
 from .posterior import MixtureDensityPosterior, Pooling
 from .priors import Prior
 from .truncation import TruncatedGaussianMixture
@@ -44,7 +45,7 @@ class AveragedPosterior:
 
     Raises:
         TypeError: One of them is of another kind.
-        ValueError: There is none, or they are of different priors or keys.
+        ValueError: There is none, or they are of different priors or keys, or on several devices.
 
     Example:
         >>> from torchrl_bayessim.inference.ensemble import fit_together, pairs_of
@@ -71,6 +72,7 @@ class AveragedPosterior:
             if not same or keys != (first.summary_key, first.theta_key):
                 expected = f"networks over {first.prior!r}, all with the same keys"
                 raise ValueError(message(expected, f"one over {network.prior!r}, keys {keys}"))
+        check_one_device(network.device for network in networks)
         self.networks = tuple(networks)
         self.summary_key, self.theta_key = first.summary_key, first.theta_key
 
@@ -78,6 +80,11 @@ class AveragedPosterior:
     def prior(self) -> Prior:
         """What all of them are over."""
         return self.networks[0].prior
+
+    @property
+    def device(self) -> torch.device:
+        """Where their weights are, and what they answer."""
+        return self.networks[0].device
 
     @property
     def seen(self) -> Tensor | None:

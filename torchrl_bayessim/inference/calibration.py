@@ -141,11 +141,12 @@ def calibrate_draws(
                 tuple(draws.shape),
             )
         )
-    theta, draws = theta.double(), draws.double()
+    draws = draws.double()
+    theta = theta.to(draws)
     jitter = torch.rand(3, len(theta), 1, generator=generator(seed, "ties"), dtype=theta.dtype)
     jitter = jitter.to(theta.device)
     own, away = _distances(theta, draws, generator(seed, "points"))
-    at_truth, at_draws = log_prob
+    at_truth, at_draws = (density.to(draws.device) for density in log_prob)
     return Calibration(
         names,
         _share(draws, theta, jitter[0]),
@@ -214,7 +215,7 @@ def calibrate(
         ['joint', 'mass']
     """
     theta = _finite(pairs, posterior.theta_key)
-    summary = _finite(pairs, posterior.summary_key)
+    summary = _finite(pairs, posterior.summary_key).to(posterior.device)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     for index, rows in enumerate(torch.arange(len(pairs)).split(_ROWS)):
         q: Any = posterior.distribution(summary[rows])

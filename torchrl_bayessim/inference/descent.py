@@ -22,6 +22,7 @@ from tqdm.auto import tqdm
 from ..errors import SimulationError, message
 from ..randomness import generator
 from .mixture_gradients import log_density_and_pullback
+from .placement import placed
 from .posterior import TRAINING_POINTS, MixtureDensityPosterior
 from .rows import PART, Rows
 from .stacked import OneNetwork, StackedNetworks, as_one
@@ -84,9 +85,8 @@ def descend(
         posterior.network.apart.fill_(1.0)
         posterior.network.tails = posterior.network.tails.new_zeros(0)
     networks = as_one([posterior.network for posterior in posteriors])
-    device = posteriors[0].network.shift.device.type
     try:
-        with torch.enable_grad(), torch.autocast(device, enabled=False):
+        with torch.enable_grad(), torch.autocast(posteriors[0].device.type, enabled=False):
             trace = _epochs(
                 posteriors[0],
                 networks,
@@ -198,6 +198,7 @@ def _reader(
 
 def _prepared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> _Pairs:
     """Return what does not change from epoch to epoch."""
+    pairs = placed(pairs, posterior.device)
     theta = pairs.get(posterior.theta_key).double()
     z = posterior.prior.standardize(theta)
     volume = posterior.prior.standardization.log_abs_det_jacobian(z, theta)

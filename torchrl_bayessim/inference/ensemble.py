@@ -139,6 +139,8 @@ def fit_together(
 def pairs_of(theta: Tensor, summary: Tensor) -> TensorDict:
     """Return ``{"theta", "summary"}`` of parameters ``(N, D)`` and what was simulated at them.
 
+    Both lie where the parameters do.
+
     Raises:
         ValueError: There is not one summary for each.
 
@@ -157,6 +159,7 @@ def pairs_of(theta: Tensor, summary: Tensor) -> TensorDict:
         raise TypeError(message("statistics that are real numbers", str(summary.dtype)))
     # counts are statistics too
     summary = summary.detach() if summary.is_floating_point() else summary.to(theta.dtype)
+    summary = summary.to(theta.device)
     return TensorDict({"theta": theta, "summary": summary}, batch_size=[len(theta)])
 
 

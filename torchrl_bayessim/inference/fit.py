@@ -21,6 +21,7 @@ from ..scalars import check_number
 from .descent import descend
 from .features import FourierFeatures
 from .input_scaling import input_scaling
+from .placement import check_one_device, placed
 from .posterior import MixtureDensityPosterior
 from .rows import Rows, mapped
 from .stacked import alike
@@ -77,7 +78,7 @@ def fit(
     If the posterior was made with an ``in_key`` or ``out_key``, the pairs' entries are those.
 
     Pairs on disk, of ``simulate(folder=)`` or ``memmap_``, stay there: some minibatches are
-    read at a time.
+    read at a time. Others are taken to the device of the posterior.
 
     AdamW with one cycle of the learning rate: see :mod:`.descent`. After every epoch the loss on
     held-out pairs is computed, and the parameters of the best epoch are kept. Pairs that are not
@@ -151,7 +152,8 @@ def fit_several(
         options: Of :func:`fit`, but for its seed; the patience is that of all of them.
 
     Raises:
-        ValueError: As :func:`fit`, no posterior, other keys of some, or not one seed for each.
+        ValueError: As :func:`fit`, no posterior, other keys of some, several devices, or not one
+            seed for each.
         SimulationError: As :func:`fit`.
         TypeError: As :func:`fit`, or one seed for all.
     """
@@ -164,6 +166,8 @@ def fit_several(
     keys = (first.theta_key, first.summary_key)
     split_seed = seeds[0] if options["split_seed"] is None else options["split_seed"]
     data = in_floats(data, *keys).select(*keys, "weight", strict=False)
+    on_disk = mapped(data)
+    data = data if on_disk else placed(data, first.device)
     rows = usable_rows(data, *keys, stacklevel=4)
     dropped = len(data) - len(rows)
     # once for those that ask for the same; which rows count is the same for all
@@ -172,7 +176,8 @@ def fit_several(
     order = rows[torch.randperm(len(rows), generator=generator(split_seed, "split"))]
     share = options["validation_fraction"]
     held_out = min(max(1, round(share * len(rows))), len(rows) - 2, _HELD_OUT)
-    validation, train = data[order[:held_out]], Rows(data, order[held_out:])
+    validation = placed(data[order[:held_out]], first.device)
+    train = Rows(data, order[held_out:])
     if options["rescale"]:
         scaling = input_scaling(part.get(keys[1]) for part in train.parts())
         warn_of(scaling, Rows(data, rows), keys[1])
@@ -183,7 +188,7 @@ def fit_several(
         posterior.held_out = validation
     names = "epochs", "batch_size", "lr", "weight_decay", "patience", "progress"
     settings = {name: options[name] for name in names}
-    train = train if mapped(data) else train[:]
+    train = train if on_disk else train[:]
     traces = []
     for group, own in _groups(posteriors, seeds):
         traces += descend(group, train, validation, seeds=own, **settings)
@@ -218,6 +223,7 @@ def _check(
     for posterior in posteriors:
         if not isinstance(posterior, MixtureDensityPosterior):
             raise TypeError(message("a MixtureDensityPosterior", type(posterior).__name__))
+    check_one_device(posterior.device for posterior in posteriors)
     keys = {(posterior.theta_key, posterior.summary_key) for posterior in posteriors}
     if len(keys) > 1:
         raise ValueError(message("posteriors of the same keys", sorted(map(str, keys))))
@@ -273,6 +279,7 @@ def select_lengthscale(
         raise TypeError(message("a posterior over FourierFeatures", type(features).__name__))
     key = posterior.summary_key
     data = in_floats(data, posterior.theta_key, key)
+    data = placed(data, posterior.device)
     pairs, _ = usable_pairs(data, theta_key=posterior.theta_key, summary_key=key)
     network.standardize_inputs(pairs[key])
     some = torch.randperm(len(pairs), generator=generator(seed, "median"))[:500]

@@ -119,9 +119,9 @@ def identifiability(
     v, theta = _draws(posterior, draws)
     gained = _gained(posterior, prior, v)
     # as the prior scales them, so that a logarithmic parameter's tail does not rule correlations
-    scaling = one_by_one(prior)
-    u = torch.where(scaling.log, torch.where(scaling.log, theta, 1.0).log(), theta)
-    narrowing = u.std(0) / scaling.scale_tril.diagonal()
+    _, scale, log = one_by_one(prior)._at(theta)
+    u = torch.where(log, torch.where(log, theta, 1.0).log(), theta)
+    narrowing = u.std(0) / scale.diagonal()
     return Identifiability(
         prior.names,
         gained.mean(0).clamp_min(0.0).float(),
@@ -161,7 +161,7 @@ def _draws(posterior: PhysicsPosterior, count: int) -> tuple[Tensor, Tensor]:
         shape = tuple(posterior.batch_shape)
         raise ValueError(message("one posterior, of batch shape ()", shape, hint=hint))
     z = posterior.mixture.sample((count,), generator=generator("identifiability"))
-    v = z @ turn(posterior.prior).mT
+    v = z @ turn(posterior.prior).to(z).mT
     if not v.isfinite().all():
         raise ValueError(message("a posterior of finite draws", "NaN or infinity among them"))
     return v, one_by_one(posterior.prior)._call(v)
@@ -171,15 +171,17 @@ def _correlation(u: Tensor) -> Tensor:
     """Return the correlation of draws ``(N, D)``, 0 with columns that vary by rounding alone."""
     varies = u.std(0) > 16 * torch.finfo(u.dtype).eps * u.abs().amax(0)
     both = varies & varies.unsqueeze(-1)
-    return torch.where(both, torch.atleast_2d(torch.corrcoef(u.mT)), torch.eye(len(both)))
+    identity = torch.eye(len(both), device=u.device)
+    return torch.where(both, torch.atleast_2d(torch.corrcoef(u.mT)), identity)
 
 
 def _prior_marginals(prior: Prior, theta: Tensor) -> Tensor:
     """Return the log-density of each parameter under the prior, shape ``(N, D)``."""
     if isinstance(prior, BoxPrior):
-        low, high = prior.low.double(), prior.high.double()
-        ratio = torch.where(prior.log, (high / low).clamp_min(1e-30).log(), 1.0)
-        logarithmic = -(ratio.log() + torch.where(prior.log, theta, 1.0).log())
-        return torch.where(prior.log, logarithmic, -(high - low).log())
-    scaling = one_by_one(prior)
-    return Normal(scaling.mean, scaling.scale_tril.diagonal()).log_prob(theta)
+        low, high, log = (part.to(theta.device) for part in (prior.low, prior.high, prior.log))
+        low, high = low.double(), high.double()
+        ratio = torch.where(log, (high / low).clamp_min(1e-30).log(), 1.0)
+        logarithmic = -(ratio.log() + torch.where(log, theta, 1.0).log())
+        return torch.where(log, logarithmic, -(high - low).log())
+    mean, scale, _ = one_by_one(prior)._at(theta)
+    return Normal(mean, scale.diagonal()).log_prob(theta)

@@ -64,10 +64,10 @@ def marginal_log_prob(posterior: PhysicsPosterior, theta: Tensor) -> Tensor:
         tensor([0.2500, 1.0000])
     """
     posterior.prior._check_event(theta)
-    theta = theta.double()
-    density = scaled_marginals(posterior, one_by_one(posterior.prior)._inverse(theta))
-    density = density - log_volume(posterior.prior, theta)
-    return density.to(torch.get_default_dtype())
+    here = theta.to(posterior.mixture.loc.device).double()
+    density = scaled_marginals(posterior, one_by_one(posterior.prior)._inverse(here))
+    density = density - log_volume(posterior.prior, here)
+    return density.to(theta.device, torch.get_default_dtype())
 
 
 def one_by_one(prior: Prior) -> Standardization:
@@ -102,14 +102,14 @@ def scaled_marginals(posterior: PhysicsPosterior, v: Tensor) -> Tensor:
     """
     mixture, box = posterior.mixture, posterior.mixture.box
     if box is None:
-        return _unbounded(mixture, v, turn(posterior.prior))
+        return _unbounded(mixture, v, turn(posterior.prior).to(v))
     return torch.stack([_bounded(mixture, box, v[..., d], d) for d in range(v.shape[-1])], -1)
 
 
 def log_volume(prior: Prior, theta: Tensor) -> Tensor:
     r"""Return :math:`\log |\partial\theta_d / \partial v_d|`, shape ``(*, D)``."""
-    log = prior.standardization.log
-    slope = prior.standardization.scale_tril.norm(dim=-1).log()
+    log = prior.standardization.log.to(theta.device)
+    slope = prior.standardization.scale_tril.norm(dim=-1).log().to(theta.device)
     return slope + torch.where(log, torch.where(log, theta, 1.0).abs().log(), 0.0)
 
 
@@ -138,7 +138,7 @@ def _bounded(
         left = covariance[..., others, :][..., others]
         left = left - cross.unsqueeze(-1) * covariance[..., others, d].unsqueeze(-2)
         # rounding may leave a nearly singular remainder not quite positive
-        left = left + 1e-12 * torch.eye(len(others), dtype=left.dtype)
+        left = left + 1e-12 * torch.eye(len(others)).to(left)
         scale = torch.linalg.cholesky(left).expand(*loc.shape[:-1], *left.shape[-2:])
         diagonal = mixture.diagonal or len(others) == 1
         mass = partial(_mass, box=(low[others], high[others]), diagonal=diagonal)

@@ -67,7 +67,7 @@ def strangeness(summaries: Tensor, observed: Tensor) -> tuple[float, Tensor]:
 def _far_out(summaries: Tensor, observed: Tensor) -> tuple[Tensor, Tensor]:
     """Return how far rows lie out, the observed one first, and its deviations from the medians."""
     simulated = summaries[summaries.isfinite().all(-1)][:_MOST].double()
-    rows = _in_spreads(torch.cat([observed[None].double(), simulated]))
+    rows = _in_spreads(torch.cat([observed[None].to(simulated), simulated]))
     seen = torch.cat([rows, _components(rows)], -1)
     distance = torch.cdist(seen, seen, p=torch.inf).fill_diagonal_(torch.inf)
     nearest = distance.topk(min(_NEIGHBOURS, len(simulated)), largest=False).values
@@ -77,7 +77,7 @@ def _far_out(summaries: Tensor, observed: Tensor) -> tuple[Tensor, Tensor]:
 def _in_spreads(rows: Tensor) -> Tensor:
     """Return columns from their medians on, each in units of its spread."""
     # quartiles, which long tails do not move; where most rows agree, the standard deviation
-    low, median, high = rows.quantile(torch.tensor([0.25, 0.5, 0.75], dtype=rows.dtype), 0)
+    low, median, high = rows.quantile(torch.tensor([0.25, 0.5, 0.75]).to(rows), 0)
     size = rows.abs().quantile(0.95, 0, interpolation="lower")  # which few absurd rows do not set
     rounding = 1e-6 * size + 1e-12
     spread = torch.where(high - low > rounding, (high - low) / 1.35, rows.std(0))
@@ -86,7 +86,7 @@ def _in_spreads(rows: Tensor) -> Tensor:
 
 def _components(rows: Tensor) -> Tensor:
     """Return principal components in their spreads, ``(N, C)``, but for those that are constant."""
-    low, high = rows.quantile(torch.tensor([0.25, 0.75], dtype=rows.dtype), 0)
+    low, high = rows.quantile(torch.tensor([0.25, 0.75]).to(rows), 0)
     bounded = rows[:, high - low > 0.5].clamp(-_BOUND, _BOUND)  # where most agree, rounding rules
     bounded = bounded - bounded.mean(0)
     _, size, directions = torch.linalg.svd(bounded, full_matrices=False)

@@ -18,6 +18,8 @@ from .truncation import TruncatedGaussianMixture
 class PhysicsPosterior(Distribution):
     """A distribution over physics parameters: a truncated mixture seen through the prior's scaling.
 
+    Draws and moments lie where the mixture does; densities where the parameters do.
+
     Args:
         mixture: In standardised coordinates, batch shape ``(*)``.
         prior: Whose coordinates, names, units and support are used.
@@ -45,9 +47,10 @@ class PhysicsPosterior(Distribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-density in the parameters' own units, shape ``(*)``."""
-        z = self.prior.standardize(value.double())
-        volume = self.prior.standardization.log_abs_det_jacobian(z, value.double())
-        return (self.mixture.log_prob(z) - volume).to(torch.get_default_dtype())
+        theta = value.to(self.mixture.loc.device).double()
+        z = self.prior.standardize(theta)
+        volume = self.prior.standardization.log_abs_det_jacobian(z, theta)
+        return (self.mixture.log_prob(z) - volume).to(value.device, torch.get_default_dtype())
 
     def sample(
         self, sample_shape: Sequence[int] = (), *, generator: torch.Generator | None = None

@@ -182,6 +182,11 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         """The network from summaries to mixture parameters."""
         return self.module[0].module  # pyright: ignore[reportReturnType]
 
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are: pairs and summaries are taken there, and answers lie there."""
+        return self.network.shift.device
+
     def distribution(self, summary: Tensor, *, points: int = POINTS) -> PhysicsPosterior:
         """Return one posterior per summary, for summaries ``(*, L)``.
 
@@ -192,7 +197,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         if not summary.is_floating_point():
             raise TypeError(message("summaries of floats", str(summary.dtype)))
         return _distribution(
-            **self.network(summary)._asdict(),
+            **self.network(summary.to(self.device))._asdict(),
             prior=self.prior,
             diagonal=self.network.covariance == "diagonal",
             points=points,
@@ -227,7 +232,7 @@ class MixtureDensityPosterior(ProbabilisticTensorDictSequential):
         expected = f"summaries of n >= 1 real trajectories, numbers of shape (n, {size})"
         given = real_numbers(expected, summaries)
         given = given if given.is_floating_point() else given.to(torch.get_default_dtype())
-        summaries = torch.atleast_2d(given.to(self.network.shift.device))
+        summaries = torch.atleast_2d(given.to(self.device))
         if summaries.shape != (len(summaries), size) or len(summaries) == 0:
             raise ValueError(
                 message(

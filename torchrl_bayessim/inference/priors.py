@@ -8,7 +8,8 @@ direction, and are where networks and mixtures work:
     z = (u - \operatorname{E}[u]) / \operatorname{sd}[u], \qquad
     u_d = \theta_d \text{ or } \log \theta_d .
 
-A prior is a torch :class:`~torch.distributions.Distribution` with event shape ``(D,)``.
+A prior is a torch :class:`~torch.distributions.Distribution` with event shape ``(D,)``. Its own
+tensors and its draws lie on the CPU; densities and coordinates lie where the parameters do.
 """
 
 from __future__ import annotations
@@ -235,7 +236,9 @@ class BoxPrior(Prior):
     ) -> Tensor:
         """Return draws of shape ``(*sample_shape, D)``, from ``generator`` if one is given."""
         shape = (*_shape(sample_shape), *self.event_shape)
-        unit = torch.rand(shape, generator=generator, dtype=self.low.dtype)
+        device = None if generator is None else generator.device
+        unit = torch.rand(shape, generator=generator, dtype=self.low.dtype, device=device)
+        unit = unit.to(self.low.device)
         low, high = self._u(self.low), self._u(self.high)
         u = low + unit * (high - low)
         theta = torch.where(self.log, u.exp(), u)
@@ -249,7 +252,7 @@ class BoxPrior(Prior):
             >>> BoxPrior({"mass": (2.0, 6.0)}).within(torch.tensor([1.0]), torch.tensor([3.0]))
             BoxPrior(mass: [2, 3])
         """
-        low, high = (real_numbers("bounds of shape (D,)", bound) for bound in (low, high))
+        low, high = (real_numbers("bounds of shape (D,)", bound).cpu() for bound in (low, high))
         if not low.shape == high.shape == self.low.shape:
             expected = f"bounds of shape {tuple(self.low.shape)}"
             raise ValueError(message(expected, (tuple(low.shape), tuple(high.shape))))
@@ -273,9 +276,10 @@ class BoxPrior(Prior):
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-density, ``-inf`` outside the box, shape ``(*)``."""
         inside = self.contains(value)
-        low, high = self._u(self.low), self._u(self.high)
-        safe = torch.where(self.log & (value > 0), value, torch.ones_like(value))
-        density = -((high - low).log() + safe.log()).sum(-1)
+        width = (self._u(self.high) - self._u(self.low)).log().to(value.device)
+        log = self.log.to(value.device)
+        safe = torch.where(log & (value > 0), value, torch.ones_like(value))
+        density = -(width + safe.log()).sum(-1)
         return torch.where(inside, density, -torch.inf)
 
     def __repr__(self) -> str:
@@ -399,9 +403,10 @@ class GaussianPrior(Prior):
         self, sample_shape: Sequence[int] = (), *, generator: torch.Generator | None = None
     ) -> Tensor:
         """Return draws of shape ``(*sample_shape, D)``, from ``generator`` if one is given."""
-        return self.unstandardize(
-            torch.randn(*_shape(sample_shape), *self.event_shape, generator=generator)
-        )
+        shape = (*_shape(sample_shape), *self.event_shape)
+        device = None if generator is None else generator.device
+        noise = torch.randn(shape, generator=generator, device=device)
+        return self.unstandardize(noise.to(self.standardization.mean.device))
 
     def contains(self, theta: Tensor) -> Tensor:
         """Return which parameters are finite: the support is all of R^D; shape ``(*)``."""
@@ -425,7 +430,7 @@ class GaussianPrior(Prior):
 def _correlation_tril(correlation: Tensor | None, size: int) -> Tensor:
     if correlation is None:
         return torch.eye(size, dtype=torch.float64)
-    correlation = real_numbers("a correlation matrix", correlation, torch.float64)
+    correlation = real_numbers("a correlation matrix", correlation, torch.float64).cpu()
     ones = torch.ones(size, dtype=torch.float64)
     if correlation.shape != (size, size) or not torch.allclose(correlation.diagonal(), ones):
         raise ValueError(

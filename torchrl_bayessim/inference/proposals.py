@@ -200,12 +200,14 @@ class HighestDensityPrior:
 
     def _resampled(self, count: int, generator: torch.Generator) -> Tensor:
         """Return draws of q in the region, resampled by p / q, which is at most p / c there."""
-        theta = self.posterior.sample((max(64 * count, 8192),), generator=generator)
+        theta = self.posterior.sample((max(64 * count, 8192),), generator=generator).cpu()
         theta = theta[self.contains(theta)]
         if len(theta) == 0:
             raise SimulationError(message("draws inside the region", "none"))
         weight = (self.prior.log_prob(theta) - self.posterior.log_prob(theta)).softmax(0)
-        return theta[torch.multinomial(weight, count, replacement=True, generator=generator)]
+        weight = weight.to(generator.device)
+        index = torch.multinomial(weight, count, replacement=True, generator=generator)
+        return theta[index.cpu()]
 
 
 def gaussian_proposal(posterior: PhysicsPosterior, *, inflate: float = 1.5) -> PhysicsPosterior:
@@ -218,9 +220,10 @@ def gaussian_proposal(posterior: PhysicsPosterior, *, inflate: float = 1.5) -> P
     mean = (weight.unsqueeze(-1) * points).sum(0)
     centred = points - mean
     covariance = (weight[:, None, None] * centred[:, :, None] * centred[:, None, :]).sum(0)
-    scale = inflate * torch.linalg.cholesky(covariance + 1e-10 * torch.eye(len(mean)))
+    identity = torch.eye(len(mean), device=mean.device)
+    scale = inflate * torch.linalg.cholesky(covariance + 1e-10 * identity)
     one = TruncatedGaussianMixture(
-        torch.zeros(1), mean[None], scale[None], posterior.prior.box, diagonal=False
+        torch.zeros_like(mean[:1]), mean[None], scale[None], posterior.prior.box, diagonal=False
     )
     return PhysicsPosterior(one, posterior.prior)
 
@@ -275,7 +278,7 @@ def analytic_correction(
     bounded = learned.prior.box is not None
     if not bounded:  # the prior is N(0, I) here, not a constant
         # before the division: a precision may need the prior's to stay positive
-        identity = torch.eye(divisor.loc.shape[-1], dtype=divisor.loc.dtype)
+        identity = torch.eye(divisor.loc.shape[-1]).to(divisor.loc)
         dividend = _times_standard_normal(dividend, identity)
     mean, covariance = divisor.loc[0], divisor.scale_tril[0] @ divisor.scale_tril[0].mT
     widest = _widest(covariance, of_prior=WIDEST**2 if bounded else 1.0)

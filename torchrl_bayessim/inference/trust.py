@@ -119,7 +119,8 @@ def trust(
         prior: What was believed before any data, if not what the network was fitted under.
         held_out: Pairs that it was not trained on; by default those that chose its best epoch and
             its width, which flatter it; none if the fit had weights.
-        simulate: Parameters ``(N, D)`` to summaries ``(N, L)``, for the posterior predictive check.
+        simulate: Parameters ``(N, D)``, on the CPU, to summaries ``(N, L)``, for the posterior
+            predictive check.
         simulations: Of that check, at least 99.
         truths: Known parameters at which the answer for n trajectories is checked, at least 50,
             with n simulations each; 0 for none. A hundred of ten take half a minute to condition.
@@ -220,7 +221,7 @@ def with_predictive(
     Raises:
         ValueError: ``simulate`` does not give a summary like it for each simulation.
     """
-    rows = torch.atleast_2d(observed)
+    rows = torch.atleast_2d(observed).cpu()
     theta = draw(told.posterior, simulations, key=(seed, "predictive"))
     predicted = _predicted(simulate, theta, rows)
     finite = predicted.isfinite().all(-1)
@@ -313,7 +314,7 @@ def _predicted(simulate: Callable[[Tensor], Tensor], theta: Tensor, rows: Tensor
     if not isinstance(predicted, Tensor) or predicted.shape != shape:
         got = tuple(predicted.shape) if isinstance(predicted, Tensor) else type(predicted).__name__
         raise ValueError(message(f"summaries of shape {shape} from simulate", got))
-    return predicted.to(rows)
+    return predicted.to(theta.device, rows.dtype)
 
 
 def _share_as_far(theta: Tensor, predicted: Tensor, rows: Tensor, *, seed: int) -> float:

@@ -139,7 +139,7 @@ def learn_shared(posterior: MixtureDensityPosterior, pairs: TensorDictBase) -> N
         pairs: Some of those of its fit: see :func:`.design_effect.shared_by_neighbours`.
     """
     summary = pairs.get(posterior.summary_key)
-    with torch.autocast(summary.device.type, enabled=False):
+    with torch.autocast(posterior.device.type, enabled=False):
         each = posterior.distribution(summary, points=TRAINING_POINTS).mixture.untruncated
     z = posterior.prior.standardize(pairs.get(posterior.theta_key)).to(each.loc)
     bounded = posterior.prior.box is not None
