@@ -57,6 +57,8 @@ def generator(*key: int | str) -> torch.Generator:
 def isolated(*key: int | str) -> Iterator[None]:
     """Seed the global generators of torch, NumPy and Python by ``key``, and restore them after.
 
+    Those of CUDA, too, once CUDA is in use.
+
     For code that draws from the global generators and takes no other (policies and collectors of
     TorchRL, third-party distributions): inside the block its draws depend on ``key`` alone, and
     the user's program does not notice.
@@ -70,8 +72,13 @@ def isolated(*key: int | str) -> Iterator[None]:
     """
     numpy_state, python_state = np.random.get_state(), random.getstate()  # noqa: NPY002
     try:
-        with torch.random.fork_rng(devices=[]):
-            torch.random.default_generator.manual_seed(seed_from(*key, "torch"))
+        # to ask an unused GPU for its state would begin its use
+        devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
+        with torch.random.fork_rng(devices=devices):
+            seed = seed_from(*key, "torch")
+            torch.random.default_generator.manual_seed(seed)
+            if devices:
+                torch.cuda.manual_seed_all(seed)
             np.random.seed(seed_from(*key, "numpy") % 2**32)  # noqa: NPY002
             random.seed(seed_from(*key, "python"))
             yield

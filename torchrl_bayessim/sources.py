@@ -144,8 +144,10 @@ class Defensive:
     def sample(self, shape: torch.Size, *, generator: torch.Generator) -> Tensor:
         """Return independent draws from the mixture, shape ``(*shape, D)``."""
         count = torch.Size(shape).numel()
-        key = int(torch.randint(2**62, (), generator=generator))
-        from_prior = torch.rand(count, generator=generator) < self.prior_share
+        device = generator.device
+        key = int(torch.randint(2**62, (), generator=generator, device=device))
+        unit = torch.rand(count, generator=generator, device=device).cpu()
+        from_prior = unit < self.prior_share
         theta = draw(self.source, count, key=(key, "source"))
         theta[from_prior] = draw(self.prior, count, key=(key, "prior"))[from_prior]
         return theta.reshape(*shape, -1)
@@ -178,7 +180,9 @@ class Empirical:
 
     def sample(self, shape: torch.Size, *, generator: torch.Generator) -> Tensor:
         """Return rows drawn with replacement, shape ``(*shape, D)``."""
-        return self.theta[torch.randint(len(self.theta), tuple(shape), generator=generator)]
+        count, device = len(self.theta), generator.device
+        index = torch.randint(count, tuple(shape), generator=generator, device=device)
+        return self.theta[index.cpu()]
 
 
 class Grid:
