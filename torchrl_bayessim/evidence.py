@@ -165,11 +165,12 @@ class EvidenceSimulator:
 
         def prepare(batch: TensorDictBase) -> TensorDictBase:
             batch = first_trajectories(batch.reshape(-1, steps))
-            return batch.set("mask", batch.get("mask") & cut)
+            mask = batch.get("mask")
+            return batch.set("mask", mask & cut.to(mask.device))
 
         action = self.statistics.action_key
         return self._summaries(
-            ReplayActions(real.get(action), action_key=action),
+            ReplayActions(real.get(action).to(self.env.device), action_key=action),
             theta,
             steps=steps,
             prepare=prepare,

@@ -291,7 +291,7 @@ class SimToRealLoop:
         new: Evidence = {
             "policy": dict(copy.deepcopy(policy).state_dict()),
             "episodes": len(real),
-            "summary": self.statistics.together(real),
+            "summary": self.statistics.together(real).cpu(),  # where a checkpoint has it
         }
         kept = real.select(*self.statistics.in_keys, "mask", ("next", "reward"), strict=False)
         state |= {"evidence": [*evidence, new], "real": _flatten(kept)}

@@ -38,6 +38,7 @@ class PPO:
 
     Args:
         env: The environment (or one like it) that batches will come from; only its specs are read.
+            Networks are made on its device.
         seed: Seed of the initial parameters and, with the key, of every update.
         observation_keys: What the policy sees; flat vectors, concatenated.
         critic_keys: What the critic sees besides, such as the physics parameters: it is needed in
@@ -122,6 +123,8 @@ class PPO:
             self.policy = actor(env, seen, hidden=hidden, initial_std=initial_std)
             value = MLP(width(env, known), hidden, 1, gain=1.0)
             self.critic = TensorDictModule(value, in_keys=known, out_keys=["state_value"])
+        self._networks = nn.ModuleDict({"policy": self.policy, "critic": self.critic})
+        self._networks.to(env.device)
         self._loss = ClipPPOLoss(
             self.policy,
             self.critic,
@@ -132,7 +135,6 @@ class PPO:
             functional=False,
         )
         self._advantage = GAE(gamma=gamma, lmbda=gae_lambda, value_network=self.critic)
-        self._networks = nn.ModuleDict({"policy": self.policy, "critic": self.critic})
         self._optimizer = torch.optim.Adam(
             self._networks.parameters(), lr=learning_rate, eps=1e-5, fused=True
         )

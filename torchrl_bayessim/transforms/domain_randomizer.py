@@ -140,7 +140,7 @@ class DomainRandomizer(Transform):
             ValueError: θ is not finite, or of another length; at a reset, of another batch.
         """
         expected = "numbers to pin, one for each parameter"
-        theta = real_numbers(expected, theta, torch.float32)
+        theta = real_numbers(expected, theta, torch.float32).cpu()
         columns = theta.shape[-1:] if self.names is None else (len(self.names),)
         if (
             not theta.ndim

@@ -124,7 +124,7 @@ class ClassicControlEnv(EnvBase):
         if mask.shape != shape or mask.dtype != torch.bool:
             got = f"{mask.dtype} of shape {tuple(mask.shape)}"
             raise ValueError(message(f"mask to be torch.bool of shape {tuple(shape)}", got))
-        written = {}
+        mask, written = mask.to(self._state.device), {}
         for name, value in values.items():
             if name not in self._parameters_now:
                 raise KeyError(
@@ -134,6 +134,7 @@ class ClassicControlEnv(EnvBase):
                 raise ValueError(
                     message(f"{name} to have shape {tuple(shape)}", tuple(value.shape))
                 )
+            value = value.to(mask.device)  # noqa: PLW2901
             usable = value.isfinite() & ((value > 0) | (name not in self.positive))
             if not (usable | ~mask).all():
                 kind = "finite and positive" if name in self.positive else "finite"
@@ -154,7 +155,7 @@ class ClassicControlEnv(EnvBase):
             raise ValueError(
                 message(f"a finite state of shape {tuple(self._state.shape)}", tuple(value.shape))
             )
-        self._state = value.to(self._float).clone()
+        self._state = value.to(self._state).clone()
 
     # What TorchRL calls.
 
