@@ -434,6 +434,13 @@ def test_impossible_settings_are_refused(options, error, match):
         DDPG(push(), goal_reward, **SMALL | options)
 
 
+def test_environments_on_a_gpu_are_refused(monkeypatch):
+    monkeypatch.setattr(CartPoleEnv, "device", torch.device("cuda:0"), raising=False)
+    env = object.__new__(CartPoleEnv)  # none can be made without a GPU
+    with pytest.raises(ValueError, match=r"environment on the CPU, where.*'one on cuda:0'\. Try"):
+        DDPG(env, goal_reward)
+
+
 def test_environments_without_goals_or_bounds_are_refused(episodes):
     with pytest.raises(ValueError, match=r"observes observation, achieved_goal, desired_goal, got"):
         DDPG(CartPoleEnv(2, max_steps=10), goal_reward)

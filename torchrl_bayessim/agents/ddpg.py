@@ -78,8 +78,8 @@ class DDPG:
         settings: What updates depend on; a loop refuses the checkpoint of other ones.
 
     Raises:
-        ValueError: A goal key is not observed, the replay buffer is smaller than one batch, or
-            there is no such algorithm.
+        ValueError: A goal key is not observed, the replay buffer is smaller than one batch, the
+            environment is on a GPU, or there is no such algorithm.
             A number is out of its bounds.
         TypeError: The actions are not bounded, or an argument is of another kind.
 
@@ -124,7 +124,7 @@ class DDPG:
             for name, value in locals().items()
             if name not in ("self", "env", "reward")
         }
-        check_kind("a TorchRL environment", env, EnvBase)
+        _check_environment(env)
         check_choice("an algorithm", algorithm, _LOSSES)
         check_keys("critic_keys", critic_keys)
         check_kind("widths of hidden layers, a sequence", hidden, tuple, list)
@@ -395,6 +395,14 @@ def _name(algorithm: str, actor_every: int | None, critic_keys: Sequence[str]) -
     if critic_keys:
         parts.append(f"critic sees {' and '.join(map(str, critic_keys))}")
     return ", ".join(parts)
+
+
+def _check_environment(env: object) -> None:
+    check_kind("a TorchRL environment", env, EnvBase)
+    assert isinstance(env, EnvBase)
+    if env.device is not None and env.device.type != "cpu":
+        expected = "an environment on the CPU, where transitions are kept, relabelled and learned"
+        raise ValueError(message(expected, f"one on {env.device}", hint='env.to("cpu"), or PPO'))
 
 
 def _check_rewards(rewards: Any) -> None:
