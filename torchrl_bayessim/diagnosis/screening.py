@@ -84,7 +84,8 @@ class Screen:
         ):
             if unit not in result or ratio > result[unit][0]:
                 amplitude = max(score, 0.0) / norm if norm > 0 else 0.0
-                scaled = float(np.clip(amplitude, 0.1, 10.0) * strength)
+                share = np.clip(amplitude, 0.1, 10.0) if unit.effect.graded else 1.0
+                scaled = float(share * strength)
                 result[unit] = float(ratio), unit.inside(scaled)
         return dict(sorted(result.items(), key=lambda item: -item[1][0]))
 
@@ -191,15 +192,22 @@ class Screen:
         )
 
 
-def screen(objective: Objective, fit: Fit, units: Sequence[Unit]) -> Screen:
+def screen(
+    objective: Objective,
+    fit: Fit,
+    units: Sequence[Unit],
+    *,
+    levels: Sequence[float] | None = None,
+) -> Screen:
     """Compare every unit at several strengths with what the fit leaves unexplained.
 
     Args:
         objective: What to explain.
         fit: What is in the model already; its units are projected out like parameters.
         units: The effects to try.
+        levels: Strengths to try, as shares of a unit's range; default those that suit it.
     """
-    rows = [(unit, level * unit.high) for unit in units for level in _levels(unit)]
+    rows = [(unit, level * unit.high) for unit in units for level in levels or _levels(unit)]
     rows += [(unit, LEVELS[-1] * unit.low) for unit in units if unit.low < 0]
     strengths = fit.point.strengths
     changes, wild = [], []

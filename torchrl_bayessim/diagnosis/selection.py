@@ -19,15 +19,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..effects.action import ActionQuantization
 from .alternatives import alternatives, exchanged, stands_in
 from .choice import chosen, fewest
 from .elimination import eliminated, without_stopgaps
-from .explanations import bent, compare, explanations
+from .explanations import Round, bent, compare, explanations
 from .form_fit import with_fitted_forms, with_forms_anew
 from .further_effects import identified, no_rival, nothing_left, stands_apart
-from .model import LIKELY, WHITE, Model, judged, judged_fits
+from .model import LIKELY, WHITE, Model, criterion, judged, judged_fits
 from .objective import Objective, Point, Unit
 from .refit import Fit
+from .rounded_commands import rounded
 from .screening import Screen
 from .shapes import with_shapes
 from .wavering import waver
@@ -185,7 +187,19 @@ class _Search:
         if self.p_values[-1] > self.alpha and not bent(best.fit):
             return None
         self.progress("fitting explanations")
-        models = judged(*self.sets, explanations(train, now))
+        better = self._explained(best, now)
+        unknown = better is None or ActionQuantization.name in better.names
+        if best.units or self.varied or not unknown:
+            return better
+        self.progress("looking for rounded commands")
+        steps = rounded(train, best.fit, self.units)
+        stepped = self._explained(best, compare(train, best.fit, steps)) if steps else None
+        found = [model for model in (better, stepped) if model is not None]
+        return min(found, key=lambda model: criterion(model, 1.0), default=None)
+
+    def _explained(self, best: Model, now: Round) -> Model | None:
+        """Return the best model with what a comparison suggests; nothing where none is worth it."""
+        models = judged(*self.sets, explanations(self.sets[0], now))
         if self.varied:  # several at once make up for a variation that is not quite known
             models = [model for model in models if len(model.names - best.names) < 2]
         self.tried += models

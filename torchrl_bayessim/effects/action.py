@@ -379,6 +379,7 @@ class ActionQuantization(ActionEffect):
     """Commands are rounded to multiples of ``s``; in their units, 0 to 20 % of ``u_max``."""
 
     name, unit, group, memoryless = "action_quantization", "command", "noise", True
+    graded = False
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.2 ``u_max``."""

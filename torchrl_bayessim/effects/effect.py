@@ -92,6 +92,8 @@ class Effect(ABC):
         limit: Whether a small strength does nothing to a robot that stays far from the limit.
         search_power: Searches and fits count strengths by ``(s / s_max)^(1 / power)``: 2 where
             what shows is a period and ``s`` its square, so that fast ones are told apart too.
+        graded: Whether twice the strength does about twice as much, so that searches may scale it:
+            of a step to which something is rounded it does not.
         nuisances: Options of `free` of which no value is the usual one: fitted like strengths, and
             what is not known of them widens the intervals of strengths in any case.
         placed: Options of `free` that are read off the data before the effect is offered, such as
@@ -106,6 +108,7 @@ class Effect(ABC):
     memoryless: ClassVar[bool] = False
     limit: ClassVar[bool] = False
     search_power: ClassVar[float] = 1.0
+    graded: ClassVar[bool] = True
     nuisances: ClassVar[tuple[str, ...]] = ()
     placed: ClassVar[tuple[str, ...]] = ()
 
