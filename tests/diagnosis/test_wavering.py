@@ -115,8 +115,9 @@ def test_a_wave_beside_a_push_is_the_push_wavering_unless_it_repeats(share, hert
     report = diagnose(
         cart(), None, logs, effects=["action_bias", "coulomb_friction", "periodic_disturbance"]
     )
-    assert report.verdict == "named"
     assert [found.name for found in report.effects] == names
+    # a wave that was not seen to repeat is named with reserve
+    assert report.verdict == ("named_partial" if hertz < 1 and len(names) > 1 else "named")
     assert sum(found.share_of_gap for found in report.effects) > 0.98
     assert any("action bias wavers, slower than" in a for a in report.alarms) == (len(names) == 1)
     # the simulator has it either way

@@ -36,8 +36,9 @@ from .rollout import rollout_errors, worse_rollouts
 from .scatter import Scatter
 from .selection import Selection
 from .shrinkage import Shrinkage
+from .unsteady_offsets import unrepeated_alarms, unsteady_offset_alarms, unsteady_offsets
 from .verdict import conclude
-from .wavering import slow_wave_alarms, slow_waves, wavering_alarms
+from .wavering import wavering_alarms
 from .whole_runs import whole_run_alarm
 
 Array = NDArray[np.float64]
@@ -106,6 +107,7 @@ def assemble(
             *doubts(found.effects, units, prepared),
             *alike(best.units, system.robot),
             *unsigned(best, prepared),
+            *unrepeated_alarms(best, prepared.sets["train"].segments, together),
             *worse_rollouts(rollouts),
         ],
         alpha=alpha,
@@ -126,7 +128,10 @@ def assemble(
         if rules:
             where |= {"regimes": [asdict(rule) for rule in rules], "regimes_of": first}
         more += wavering_alarms(best, prepared.sets["train"].segments)
-        more += [*slow_wave_alarms(together), *dry_friction_alarms(best, together, system.robot)]
+        more += [
+            *unsteady_offset_alarms(together),
+            *dry_friction_alarms(best, together, system.robot),
+        ]
     names, measured = {effect.name for effect in found.effects}, found.measured
     left = measured.effects if names else measured.refit
     seen = concluded(seen, verdict, names | together.keys() if names else names, left=left)
@@ -164,7 +169,7 @@ def _causes(prepared: Prepared, selection: Selection) -> tuple[dict[str, float],
     """Return the credit of each cause, and the effects that are told with another's name."""
     best, robot = selection.best, prepared.predictor.system.robot
     credit = credit_of(selection)
-    together = slow_waves(best, prepared.sets["train"].segments, robot)
+    together = unsteady_offsets(best, prepared.sets["train"].segments, robot)
     together |= dry_friction(best, credit, robot)
     return told_together(credit, together), together
 

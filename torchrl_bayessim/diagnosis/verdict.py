@@ -179,7 +179,8 @@ class _Weighed:
         borne_out = certain or measured.effects < measured.refit or validated >= PARTIAL
         found = p_value <= alpha and borne_out and bool(selection.best.units)
         significant = found or by_chance
-        several = len(effects) > 1
+        # told as one cause or not: together, laws imitate many a third one nearly
+        several = len(effects) > 1 or len(selection.best.names) > 1
         return cls(
             measured, significant, certain, visible, validated, unsaid, elsewhere, helps, several
         )

@@ -13,23 +13,17 @@ with :math:`c_u` what unit :math:`u` changes altogether, :math:`b_{lk}` the run 
 segment times its place in it to the power :math:`k = 0, 1`, and :math:`\sigma = 0.3` of a strength.
 If that leaves no more than the further effect does, by what the numbers cost, the effect is not
 needed: what remains lies in strengths that are not constant (random coefficients, Swamy 1970).
-
-Of a wave a run has to hold two periods to show that it repeats. A slower one beside a push at the
-same joint, of which it is a part, is that push wavering, and no cause of its own: it stays in the
-simulator, and is told with the push.
 """
 
 from __future__ import annotations
 
-__all__ = ["slow_wave_alarms", "slow_waves", "waver", "wavering_alarms"]
+__all__ = ["waver", "wavering_alarms"]
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects.disturbance import ConstantForce, PeriodicDisturbance
-from ..effects.robot import Robot
 from .cells import plain
 from .model import WHITE, Model, price
 from .objective import Unit
@@ -40,7 +34,6 @@ Array = NDArray[np.float64]
 _PART = 0.3  # standard deviation of a strength that wavers, of itself
 _POWERS = 2  # of time in a run: a constant, and a trend
 _MOST = 0.5  # of what remains
-_REPEATS = 2.0  # periods in a run
 
 
 def waver(base: Model, better: Model, segments: Segments) -> bool:
@@ -82,58 +75,6 @@ def wavering_alarms(model: Model, segments: Segments) -> list[str]:
         )
     most = max(texts, default=0.0)
     return [texts[most]] if most > _MOST else []
-
-
-def slow_waves(model: Model, segments: Segments, robot: Robot) -> dict[str, str]:
-    """Return the periodic force that is a push wavering, by its name, and the push's name.
-
-    Every one of its units has less than two periods in the longest run, and is less than 0.3 of a
-    constant push at its joint.
-
-    Args:
-        model: With the effects that were found.
-        segments: The training segments.
-        robot: Where they act.
-    """
-    waves = [u for u in model.units if isinstance(u.effect, PeriodicDisturbance)]
-    runs = [segments.time[segments.log == log] for log in np.unique(segments.log)]
-    longest = max(float(np.ptp(run)) for run in runs)
-    found: dict[str, str] = {}
-    for wave in waves:
-        push = _push_beside(model, wave, robot)
-        if push is None or wave.effect.frequency * longest >= _REPEATS:
-            return {}
-        found[wave.name] = push.name
-    return found
-
-
-def _push_beside(model: Model, wave: Unit, robot: Robot) -> Unit | None:
-    """Return the largest push at the joint of a wave that is a small part of it."""
-    # a sine's root mean square, of its amplitude
-    least = _size(model, wave) / (np.sqrt(0.5) * _PART)
-    pushes = [
-        u
-        for u in model.units
-        if u.effect.group == ConstantForce.group
-        and u.effect.channel != "sensing"
-        and u.joint(robot) == wave.joint(robot)
-    ]
-    largest = max(pushes, key=lambda unit: _size(model, unit), default=None)
-    return largest if largest is not None and _size(model, largest) > least else None
-
-
-def _size(model: Model, unit: Unit) -> float:
-    return float(np.linalg.norm(model.fit.change(unit)))
-
-
-def slow_wave_alarms(together: Mapping[str, str]) -> list[str]:
-    """Return an alarm for each wave among what is told together, by its name with its push's."""
-    return [
-        f"{plain(push)} wavers, slower than runs can show to repeat: in the simulator a "
-        f"{plain(wave)} stands for that"
-        for wave, push in together.items()
-        if wave == PeriodicDisturbance.name
-    ]
 
 
 def _left(fit: Fit, loose: Array, scale: float) -> tuple[float, Array]:
