@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from test_lost_values import TWO, run_of_two
+from test_diagnose import logs, system
+from test_lost_values import TWO, run_of_two, shown_again
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.lost_samples import _interpolated
@@ -94,6 +95,24 @@ def test_a_gain_that_lost_samples_hide_is_found_beside_them():
     (note,) = (alarm for alarm in report.alarms if "interpolated" in alarm)
     assert "of 900 samples are taken to have been lost" in note
     assert report.gap.with_effects < 1.3 < report.gap.refit
+
+
+def late(u, k):
+    """Return the command behind a filter of the first order, of three control steps."""
+    weights = 0.25 * 0.75 ** np.arange(k + 1)
+    return float(weights @ u[k::-1])
+
+
+def test_samples_are_lost_beside_a_slow_drive():
+    rng = np.random.default_rng(8)
+    data = [shown_again(log, 0.12, rng) for log in logs(8, act=late)]
+    some = "sensor_dropout", "action_lag", "action_delay", "coulomb_friction", "packet_drop"
+    report = diagnose(system(), None, data, effects=some)
+    found = {effect.name: effect for effect in report.effects}
+    assert set(found) == {"action_lag", "sensor_dropout"}
+    assert found["sensor_dropout"].strength == pytest.approx(0.12, rel=0.3)
+    report = diagnose(system(), None, logs(8, act=late), effects=some)
+    assert [effect.name for effect in report.effects] == ["action_lag"]
 
 
 def test_no_sample_is_replaced_where_losses_are_all_there_is():

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects.action import PacketDrop
+from ..effects.action import ActionDelay, PacketDrop
 from ..effects.contacts import ContactFriction
 from ..effects.sensors import SensorBias
 from .chance import Chance
@@ -56,6 +56,7 @@ _REMAIN = 0.6  # or of those that were spoiled without losses
 # to be evident, whatever else is wrong: deviance, errors without losses per those with them, and
 # segments that losses do not explain
 _EVIDENT, _TIMES, _WRONG = 100.0, 4.0, 0.3
+_LATE = ActionDelay.group
 _INTERVAL = 3.92  # standard deviations that are 95 %
 _WIDER = 1.5  # times: errors were, on robots whose share was known
 
@@ -133,7 +134,7 @@ def lost_beside(seen: Evident, model: Model) -> Chance | None:
         seen: The losses that are evident, in segments with the commands that were sent.
         model: The effects.
     """
-    if not _apart(model.units):
+    if not _apart(seen.unit, model.units):
         return None
     data = {name: one.at(model.fit.point) for name, one in seen.segments.items()}
     return found_beside(data, seen.unit, Alone.of(data), model.units)
@@ -155,8 +156,9 @@ def losses(prepared: Prepared, selection: Selection, suspects: Suspects) -> list
     alone = suspects.alone
     # what the best explanation without chance gains by the same standard
     found, least = _all_found(nominal, some, alone), sum(alone.costs) - sum(rival.costs)
-    if selection.best.units and _apart(selection.best.units):
-        others = _all_found(best, some, rival, selection.best.units)
+    able = [unit for unit in some if _apart(unit, selection.best.units)]
+    if selection.best.units and able:
+        others = _all_found(best, able, rival, selection.best.units)
         beside = [replace(one, beside=True) for one in others]
         if _most(beside) > _most(found) - least + _NEEDED:
             found, least = beside, 0.0
@@ -173,24 +175,26 @@ def _telling(prepared: Prepared, units: Sequence[Unit]) -> list[Unit]:
     return [u for u in units if isinstance(u.effect, PacketDrop) or not rests[u.direction.index(1)]]
 
 
-def _apart(others: Sequence[Unit]) -> bool:
+def _apart(unit: Unit, others: Sequence[Unit]) -> bool:
     """Return whether losses beside effects could not be another form of those.
 
-    A lag that is not quite the true one, and contacts that stick and slip a little otherwise, err
-    as samples and commands would that were lost.
+    A lag that is not quite the true one errs as commands would that were lost, and contacts that
+    stick and slip a little otherwise as commands and samples would.
     """
-    known = [unit.effect for unit in others]
-    late = any(e.group == "timing" for e in known)
-    return not late and not any(isinstance(e, ContactFriction) for e in known)
+    known = [other.effect for other in others]
+    late = any(effect.group == _LATE for effect in known)
+    commands = isinstance(unit.effect, PacketDrop)
+    return not (late and commands) and not any(isinstance(e, ContactFriction) for e in known)
 
 
 def _sensed(others: Sequence[Unit]) -> bool:
-    """Return whether effects are of sensors, and more than a constant or a slow drift.
+    """Return whether effects are late, or of sensors and more than a constant or a slow drift.
 
     Samples err with these as if a few were lost; they have to be clearly.
     """
     known = [unit.effect for unit in others]
-    return any(e.channel == "sensing" and e.group != SensorBias.group for e in known)
+    sensing = any(e.channel == "sensing" and e.group != SensorBias.group for e in known)
+    return sensing or any(effect.group == _LATE for effect in known)
 
 
 def _all_found(
