@@ -13,10 +13,12 @@ import numpy as np
 
 from .elimination import parts
 from .further_effects import surely_elsewhere
+from .model import Model
 from .objective import Objective, Unit
 from .selection import Selection
 
 _LEAST = 0.005  # of the credit, to be named beside another cause
+_PLAIN, _OFF = 25.0, 0.01  # deviance that an effect removes; p-value of what is left
 _MORE = 1.5  # times what is left with it, without
 
 
@@ -37,9 +39,18 @@ def worthwhile(selection: Selection, sets: Mapping[str, Objective]) -> Selection
         best = min(without, key=lambda model: float(model.deviances().sum()))
         if best.deviances().sum() > _MORE * selection.best.deviances().sum():
             return selection  # little of the gap, but most of what is left of it
+        if _surely_needed(best, selection):
+            return selection
         if surely_elsewhere(best, selection.best, sets["train"].predictor.system.robot):
             return selection
         selection = selection.reduced(best)
+
+
+def _surely_needed(without: Model, selection: Selection) -> bool:
+    """Return whether an effect is plainly needed by a model that is off nowhere."""
+    best = selection.best
+    lost = float((without.deviances() - best.deviances()).sum()) / best.dispersion()
+    return lost > _PLAIN and selection.p_values[-1] > _OFF
 
 
 def _apart(selection: Selection, sets: Mapping[str, Objective]) -> Selection:

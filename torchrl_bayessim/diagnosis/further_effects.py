@@ -8,7 +8,14 @@ under another name, and stands beside it as its rival.
 
 from __future__ import annotations
 
-__all__ = ["identified", "no_rival", "nothing_left", "stands_apart", "surely_elsewhere"]
+__all__ = [
+    "identified",
+    "no_rival",
+    "nothing_left",
+    "numerical",
+    "stands_apart",
+    "surely_elsewhere",
+]
 
 import math
 from collections.abc import Mapping, Sequence
@@ -67,7 +74,7 @@ def identified(
         return False
     if not _elsewhere(base, better, seen, robot, far=_FAR if left else _FARTHER):
         return False
-    return left or not _numerical(start, base, better, timestep)
+    return left or not numerical(start, base, better, timestep)
 
 
 def _matters(
@@ -105,7 +112,7 @@ def stands_apart(base: Model, seen: Screen, robot: Robot) -> bool:
     return unit is not None and told[unit] > _apart_from(unit.effect.group, told, _FARTHER)
 
 
-def _numerical(start: Model, base: Model, better: Model, timestep: float) -> bool:
+def numerical(start: Model, base: Model, better: Model, timestep: float) -> bool:
     """Return whether a simulator that integrates otherwise would leave what is added.
 
     It is late by a part of its time step, and its forces are off by a hundredth.

@@ -26,6 +26,7 @@ from .elimination import eliminated, without_stopgaps
 from .explanations import Round, bent, compare, explanations
 from .form_fit import with_fitted_forms, with_forms_anew
 from .further_effects import identified, no_rival, nothing_left, stands_apart
+from .little_left import all_of_little, little_left
 from .model import LIKELY, WHITE, Model, criterion, judged, judged_fits
 from .objective import Objective, Point, Unit
 from .refit import Fit
@@ -181,36 +182,59 @@ class _Search:
             models = _anew(*self.sets, self.known)
             self.tried = [self.start, *models]
             return models[0]
-        if enough and not stands_apart(best, now.seen, train.predictor.system.robot):
+        apart = not enough or stands_apart(best, now.seen, train.predictor.system.robot)
+        if not apart and not little_left(best, self.p_values[-1]):
             return None
         # where much is left, what a first derivative does not see may still be the cause
         if self.p_values[-1] > self.alpha and not bent(best.fit):
             return None
         self.progress("fitting explanations")
-        better = self._explained(best, now)
+        better = self._explained(
+            now,
+            partial(self._better, best, seen=now.seen)
+            if apart
+            else partial(self._all, best, left=left),
+        )
         unknown = better is None or ActionQuantization.name in better.names
         if best.units or self.varied or not unknown:
             return better
         self.progress("looking for rounded commands")
         steps = rounded(train, best.fit, self.units)
-        stepped = self._explained(best, compare(train, best.fit, steps)) if steps else None
+        stepped = None
+        if steps:
+            now = compare(train, best.fit, steps)
+            stepped = self._explained(now, partial(self._better, best, seen=now.seen))
         found = [model for model in (better, stepped) if model is not None]
         return min(found, key=lambda model: criterion(model, 1.0), default=None)
 
-    def _explained(self, best: Model, now: Round) -> Model | None:
+    def _explained(
+        self, now: Round, best_of: Callable[[Sequence[Model]], Model | None]
+    ) -> Model | None:
         """Return the best model with what a comparison suggests; nothing where none is worth it."""
         models = judged(*self.sets, explanations(self.sets[0], now))
         if self.varied:  # several at once make up for a variation that is not quite known
-            models = [model for model in models if len(model.names - best.names) < 2]
+            there = {unit.name for unit in now.base.units}
+            models = [model for model in models if len(model.names - there) < 2]
         self.tried += models
-        worth = partial(self.worth, seen=now.seen)
-        better = chosen(best, models)
-        better = fewest(self.sets, best, better, models, worth=worth, offered=self.offered)
-        if better is None or not worth(best, better, models):
+        better = best_of(models)
+        if better is None:
             return None
         fitted = with_fitted_forms(*self.sets, _exactly(*self.sets, better), self.offered)
         self.tried += [better, fitted]
         return fitted
+
+    def _better(self, best: Model, models: Sequence[Model], seen: Screen) -> Model | None:
+        """Return the best model with more than the base, if that is worth it."""
+        worth = partial(self.worth, seen=seen)
+        better = chosen(best, models)
+        better = fewest(self.sets, best, better, models, worth=worth, offered=self.offered)
+        return better if better is not None and worth(best, better, models) else None
+
+    def _all(self, best: Model, models: Sequence[Model], left: Sequence[Unit]) -> Model | None:
+        """Return the model with one effect more, if that is all of the little that is left."""
+        missing = lambda seen, model: _p_value(seen, model, self.generator) < self.alpha
+        train = self.sets[0]
+        return all_of_little(self.start, best, models, train=train, left=left, missing=missing)
 
     def _needs(self, best: Model) -> Model:
         """Return the model without the effects that it does not need."""

@@ -1,0 +1,60 @@
+"""A weak cause beside a strong one is named if it is all of the little that is left."""
+
+import numpy as np
+import pytest
+from plain_models import A, Unit, plain
+from test_diagnose import logs, system
+
+from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.little_left import little_left
+
+SOME = (
+    "dead_band", "quadratic_drag", "coulomb_friction", "action_lag", "action_gain",
+    "parallel_spring", "sensor_gain", "payload",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("units", "left", "p_value", "little"),
+    [
+        ([A], 440.0, 1e-8, True),
+        ([A], 440.0, 1e-3, False),
+        ([A], 600.0, 1e-8, False),
+        ([], 440.0, 1e-8, False),
+        ([Unit("friction", "hip")], 440.0, 1e-8, False),
+        ([Unit("backlash", "hip", group="elasticity")], 440.0, 1e-8, False),
+        ([Unit("delay", "x", group="timing")], 440.0, 1e-8, False),
+        ([A, Unit("payload", "hip")], 440.0, 1e-8, False),
+    ],
+    ids=[
+        "little",
+        "perhaps nothing",
+        "more",
+        "no cause yet",
+        "it sticks",
+        "it gives way",
+        "it is late",
+        "two causes",
+    ],
+)
+def test_little_is_left_if_it_is_hardly_more_than_noise_and_surely_more(
+    units, left, p_value, little
+):
+    assert little_left(plain(units, left), p_value) == little
+
+
+def test_a_drag_that_is_a_thousandth_of_the_gap_at_most_is_named_beside_a_dead_band():
+    found = weak(drag=0.001)
+    assert set(found) == {"dead_band", "quadratic_drag"}
+    assert found["dead_band"].strength == pytest.approx(0.5, rel=0.05)
+    assert found["quadratic_drag"].strength == pytest.approx(0.001, rel=0.3)
+    assert found["quadratic_drag"].share_of_gap < 0.01
+    assert set(weak(drag=0.0)) == {"dead_band"}
+
+
+def weak(drag):
+    """Return what is found of an arm with a dead band and some drag, by name."""
+    act = lambda u, k: np.sign(u[k]) * max(abs(u[k]) - 0.5, 0.0)
+    push = lambda q, v: -drag * v * abs(v)
+    report = diagnose(system(), None, logs(10, 300, act=act, push=push), effects=SOME)
+    return {effect.name: effect for effect in report.effects}

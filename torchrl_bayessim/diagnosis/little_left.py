@@ -1,0 +1,81 @@
+"""A second effect where the first leaves little: named if it is all of that, and nothing else is.
+
+A weak cause beside a strong one is a thousandth of the gap, and as much is left by the form of a
+law that is not quite the true one. But what is true explains the rest to the noise, with one
+strength, and no effect of another kind does; what mends the form of another law leaves something
+still, by the test that found that something is missing, or is one of several that mend as much.
+"""
+
+from __future__ import annotations
+
+__all__ = ["all_of_little", "little_left"]
+
+from collections.abc import Callable, Sequence
+
+from ..effects.action import ActionDelay
+from ..effects.compliance import Backlash
+from ..effects.friction import QuadraticDrag
+from ..effects.joints import CoulombFriction, ParallelSpring, ViscousFriction
+from .choice import chosen
+from .explanations import compare
+from .further_effects import no_rival, numerical
+from .model import WHITE, Model
+from .objective import Objective, Unit
+from .screening import Screen
+from .wavering import waver
+
+_SURELY = 1e-4  # p-value of what is left, to look for one effect that is all of it
+_PLAIN = 25.0  # deviance that it removes, which chance hardly makes of any of a hundred units
+_FORMS = CoulombFriction.group, Backlash.group, ActionDelay.group
+_SMOOTH = ViscousFriction, QuadraticDrag, ParallelSpring
+
+
+def little_left(best: Model, p_value: float) -> bool:
+    """Return whether a model of one effect leaves little more than noise, but surely more.
+
+    Of one, since a third effect mends the forms of two others more easily. Not beside what sticks,
+    friction or a drive that gives way, which no time step follows exactly, nor beside what is late,
+    by a delay or by filters, which are forms of each other.
+
+    Args:
+        best: With the effects that were found.
+        p_value: Of what it leaves.
+    """
+    if len(best.names) != 1 or best.mean_square > WHITE or p_value > _SURELY:
+        return False
+    return not any(
+        unit.effect.group in _FORMS and not isinstance(unit.effect, _SMOOTH) for unit in best.units
+    )
+
+
+def all_of_little(
+    start: Model,
+    best: Model,
+    models: Sequence[Model],
+    *,
+    train: Objective,
+    left: Sequence[Unit],
+    missing: Callable[[Screen, Model], bool],
+) -> Model | None:
+    """Return the model with the one effect that is all of the little that is left, if one is.
+
+    Args:
+        start: Parameters alone.
+        best: With the effects that were found.
+        models: All that were tried beside those.
+        train: Where models are fitted.
+        left: Units that a model may lack.
+        missing: Told a screen of a model, and the model: whether something surely is missing.
+    """
+    single = [model for model in models if len(model.units) == len(best.units) + 1]
+    better = chosen(best, single)
+    if better is None:
+        return None
+    timestep = float(train.predictor.system.task.model.opt.timestep)
+    lost = float((best.deviances() - better.deviances()).sum()) / better.dispersion()
+    if lost < _PLAIN or numerical(start, best, better, timestep):
+        return None
+    others = [unit for unit in left if unit.name not in better.names]
+    if not no_rival(best, better, single) or waver(best, better, train.segments):
+        return None
+    return None if missing(compare(train, better.fit, others).seen, better) else better
