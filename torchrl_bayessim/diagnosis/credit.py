@@ -47,8 +47,10 @@ def worthwhile(selection: Selection, sets: Mapping[str, Objective]) -> Selection
 
 
 def _surely_needed(without: Model, selection: Selection) -> bool:
-    """Return whether an effect is plainly needed by a model that is off nowhere."""
+    """Return whether one of two effects is plainly needed by a model that is off nowhere."""
     best = selection.best
+    if len(best.names) != 2:  # a third one mends the forms of two others more easily
+        return False
     lost = float((without.deviances() - best.deviances()).sum()) / best.dispersion()
     return lost > _PLAIN and selection.p_values[-1] > _OFF
 

@@ -216,8 +216,9 @@ def found_beside(
 ) -> Chance | None:
     """Return the losses of a unit beside others, nothing if they do not explain what they spoil.
 
-    Commands beside an effect have to stand out, or to leave nothing of what they spoil: a force law
-    that is not quite the true one errs everywhere a little, as if ever so many of them were lost.
+    Commands beside an effect have to leave nothing of what they spoil, and to stand out or be many:
+    a force law that is not quite the true one errs everywhere a little, as if ever so many of them
+    were lost.
     """
     tried, base = {name: one.tried(unit) for name, one in data.items()}, alone.law
     judged = [tried[name] for name in JUDGED]
@@ -276,5 +277,6 @@ def _explain(
         return False  # something else is wrong everywhere, and may look like this
     if after > _EXPLAINED * before:
         return False
-    faint = law.share > unit.high or (before < _STANDS_OUT and not clear)
+    faint = law.share > unit.high or after >= _CLEARLY * before
+    faint |= before < _STANDS_OUT and not clear
     return not (others and isinstance(unit.effect, PacketDrop) and faint)
