@@ -1,5 +1,7 @@
 """A weak cause beside a strong one is named if it is all of the little that is left."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from plain_models import A, Unit, plain
@@ -12,6 +14,13 @@ SOME = (
     "dead_band", "quadratic_drag", "coulomb_friction", "action_lag", "action_gain",
     "parallel_spring", "sensor_gain", "payload",
 )  # fmt: skip
+
+
+def of_segments(**parts):
+    return SimpleNamespace(segments=SimpleNamespace(**parts))
+
+
+FREE = of_segments(touching=None)
 
 
 @pytest.mark.parametrize(
@@ -40,7 +49,13 @@ SOME = (
 def test_little_is_left_if_it_is_hardly_more_than_noise_and_surely_more(
     units, left, p_value, little
 ):
-    assert little_left(plain(units, left), p_value) == little
+    assert little_left(plain(units, left), p_value, FREE) == little
+
+
+def test_what_touches_the_ground_leaves_more_than_noise_anyway():
+    model = plain([A], 440.0)
+    assert little_left(model, 1e-8, FREE)
+    assert not little_left(model, 1e-8, of_segments(touching=np.ones((4, 9), dtype=bool)))
 
 
 def test_a_drag_that_is_a_thousandth_of_the_gap_at_most_is_named_beside_a_dead_band():

@@ -215,9 +215,14 @@ def test_which_commands_arrived_is_decided_on_again_while_that_helps(monkeypatch
 @pytest.mark.parametrize(
     ("name", "apart", "sensed"),
     [("dead_band", True, False), ("sensor_bias", True, False), ("sensor_drift", True, False),
-     ("sensor_gain", True, True), ("sensor_lag", False, True), ("action_delay", False, False)],
+     ("sensor_gain", True, True), ("sensor_lag", False, True), ("action_delay", False, True)],
 )  # fmt: skip
 def test_losses_are_not_told_beside_what_errs_as_they_do(name, apart, sensed):
     units = units_of([effect(name)], system().robot)
-    assert _apart(units) == apart
+    commands, samples = (
+        units_of([effect(random)], system().robot)[0]
+        for random in ("packet_drop", "sensor_dropout")
+    )
+    assert _apart(commands, units) == apart
+    assert _apart(samples, units)  # but clearly, beside what errs as they do
     assert _sensed(units) == sensed  # where they have to be clear

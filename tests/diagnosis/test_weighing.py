@@ -11,7 +11,7 @@ from torchrl_bayessim.diagnosis.verdict import _Weighed
 
 def verdict(
     *, refit, left, sure, chance=False, validation=(1.0, 1.0), raw=9.0, ci=(-2.0, 1.0), count=1,
-    by_chance=1.0,
+    by_chance=1.0, laws=1,
 ):  # fmt: skip
     """Return the verdict on one effect: mean squared innovations of test runs and validation."""
     explained = (refit - left) / max(refit - 1.0, 1e-9)
@@ -21,6 +21,7 @@ def verdict(
     models = [
         SimpleNamespace(
             units=units,
+            names=units * laws,
             validation=np.full((20, 100), mean**0.5),
             fit=SimpleNamespace(innovations=np.full((20, 100), mean**0.5)),
         )
@@ -89,6 +90,12 @@ def test_two_effects_may_leave_less_than_one(count, left, said):
         count=count,
     )  # fmt: skip
     assert answer == said
+
+
+def test_two_laws_that_are_told_as_one_cause_may_leave_less_than_one():
+    known = {"refit": 200.0, "raw": 300.0, "left": 1.9, "sure": 1e-20, "ci": (0.9, 1.0)}
+    assert verdict(**known, validation=(9.0, 1.1), laws=1) == "named"
+    assert verdict(**known, validation=(9.0, 1.1), laws=2) == "named_partial"
 
 
 @pytest.mark.parametrize(

@@ -30,17 +30,20 @@ _FORMS = CoulombFriction.group, Backlash.group, ActionDelay.group
 _SMOOTH = ViscousFriction, QuadraticDrag, ParallelSpring
 
 
-def little_left(best: Model, p_value: float) -> bool:
+def little_left(best: Model, p_value: float, train: Objective) -> bool:
     """Return whether a model of one effect leaves little more than noise, but surely more.
 
     Of one, since a third effect mends the forms of two others more easily. Not beside what sticks,
-    friction or a drive that gives way, which no time step follows exactly, nor beside what is late,
-    by a delay or by filters, which are forms of each other.
+    friction, a drive that gives way or contacts, which no time step follows exactly, nor beside
+    what is late, by a delay or by filters, which are forms of each other.
 
     Args:
         best: With the effects that were found.
         p_value: Of what it leaves.
+        train: The segments of the fit.
     """
+    if train.segments.touching is not None:
+        return False
     if len(best.names) != 1 or best.mean_square > WHITE or p_value > _SURELY:
         return False
     return not any(

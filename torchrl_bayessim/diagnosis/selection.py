@@ -183,7 +183,7 @@ class _Search:
             self.tried = [self.start, *models]
             return models[0]
         apart = not enough or stands_apart(best, now.seen, train.predictor.system.robot)
-        if not apart and not little_left(best, self.p_values[-1]):
+        if not apart and not little_left(best, self.p_values[-1], train):
             return None
         # where much is left, what a first derivative does not see may still be the cause
         if self.p_values[-1] > self.alpha and not bent(best.fit):
