@@ -7,8 +7,11 @@ import pytest
 from plain_models import A, Unit, plain
 from test_diagnose import logs, system
 
+from torchrl_bayessim.diagnosis import objective
 from torchrl_bayessim.diagnosis.diagnose import diagnose
-from torchrl_bayessim.diagnosis.little_left import little_left
+from torchrl_bayessim.diagnosis.little_left import little_left, one_alone
+from torchrl_bayessim.diagnosis.screening import Screen
+from torchrl_bayessim.effects.joints import ViscousFriction
 
 SOME = (
     "dead_band", "quadratic_drag", "coulomb_friction", "action_lag", "action_gain",
@@ -56,6 +59,27 @@ def test_what_touches_the_ground_leaves_more_than_noise_anyway():
     model = plain([A], 440.0)
     assert little_left(model, 1e-8, FREE)
     assert not little_left(model, 1e-8, of_segments(touching=np.ones((4, 9), dtype=bool)))
+
+
+@pytest.mark.parametrize(("rest", "alone"), [(0.0, True), (12.0, False)])
+def test_one_effect_is_all_of_it_if_beside_it_no_other_shows(rest, alone):
+    """Two signatures at right angles: what the second explains, the first does not."""
+    units = tuple(objective.Unit(ViscousFriction(), name, (1.0,), 0.0, 1.0) for name in "ab")
+    zero, one = np.zeros(2), np.ones(2)
+    seen = Screen(
+        units=units,
+        strengths=one,
+        norms=one,
+        sizes=one,
+        scores=np.array([20.0, rest]),
+        correlation=np.eye(2),
+        swallowed=zero,
+        residual=400.0 + rest**2,
+        effective=1000,
+        changes=(np.zeros((1, 1), np.float32),) * 2,
+        growth=one,
+    )
+    assert one_alone(seen, 1.0, np.random.default_rng(0)) == alone
 
 
 def test_a_drag_that_is_a_thousandth_of_the_gap_at_most_is_named_beside_a_dead_band():

@@ -8,9 +8,11 @@ still, by the test that found that something is missing, or is one of several th
 
 from __future__ import annotations
 
-__all__ = ["all_of_little", "little_left"]
+__all__ = ["all_of_little", "little_left", "one_alone"]
 
 from collections.abc import Callable, Sequence
+
+import numpy as np
 
 from ..effects.action import ActionDelay
 from ..effects.compliance import Backlash
@@ -26,6 +28,8 @@ from .wavering import waver
 
 _SURELY = 1e-4  # p-value of what is left, to look for one effect that is all of it
 _PLAIN = 25.0  # deviance that it removes, which chance hardly makes of any of a hundred units
+_DRAWS, _RARELY = 1000, 0.99  # of noise, and where the largest ratio of so many of them lies
+_MORE = 2.0  # times that: what a fit may explain and a screen does not
 _FORMS = CoulombFriction.group, Backlash.group, ActionDelay.group
 _SMOOTH = ViscousFriction, QuadraticDrag, ParallelSpring
 
@@ -49,6 +53,20 @@ def little_left(best: Model, p_value: float, train: Objective) -> bool:
     return not any(
         unit.effect.group in _FORMS and not isinstance(unit.effect, _SMOOTH) for unit in best.units
     )
+
+
+def one_alone(seen: Screen, dispersion: float, generator: np.random.Generator) -> bool:
+    """Return whether one unit may be all that is missing: beside the strongest no other shows.
+
+    Args:
+        seen: What is missing, compared with all units.
+        dispersion: Its variance.
+        generator: Of the null distribution's draws.
+    """
+    strongest = next(iter(seen.best(dispersion)))
+    others = seen.beside([strongest], dispersion)
+    noise = np.quantile(seen.null(_DRAWS, generator), _RARELY)
+    return max(others.values(), default=0.0) < _MORE * float(noise)
 
 
 def all_of_little(

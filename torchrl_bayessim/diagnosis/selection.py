@@ -26,7 +26,7 @@ from .elimination import eliminated, without_stopgaps
 from .explanations import Round, bent, compare, explanations
 from .form_fit import with_fitted_forms, with_forms_anew
 from .further_effects import identified, no_rival, nothing_left, stands_apart
-from .little_left import all_of_little, little_left
+from .little_left import all_of_little, little_left, one_alone
 from .model import LIKELY, WHITE, Model, criterion, judged, judged_fits
 from .objective import Objective, Point, Unit
 from .refit import Fit
@@ -183,7 +183,7 @@ class _Search:
             self.tried = [self.start, *models]
             return models[0]
         apart = not enough or stands_apart(best, now.seen, train.predictor.system.robot)
-        if not apart and not little_left(best, self.p_values[-1], train):
+        if not apart and not self._little(best, now.seen):
             return None
         # where much is left, what a first derivative does not see may still be the cause
         if self.p_values[-1] > self.alpha and not bent(best.fit):
@@ -206,6 +206,12 @@ class _Search:
             stepped = self._explained(now, partial(self._better, best, seen=now.seen))
         found = [model for model in (better, stepped) if model is not None]
         return min(found, key=lambda model: criterion(model, 1.0), default=None)
+
+    def _little(self, best: Model, seen: Screen) -> bool:
+        """Return whether little is left, and one effect may be all of it."""
+        dispersion = max(1.0, best.fit.mean_square)
+        little = little_left(best, self.p_values[-1], self.sets[0])
+        return little and one_alone(seen, dispersion, self.generator)
 
     def _explained(
         self, now: Round, best_of: Callable[[Sequence[Model]], Model | None]
