@@ -3,12 +3,12 @@
 import pytest
 from plain_models import A, C, Unit, plain
 
-from torchrl_bayessim.diagnosis.selection import _Search
+from torchrl_bayessim.diagnosis.search import Search
 
 WEAK = Unit("magnets", "hip")
 
 
-class Scripted(_Search):
+class Scripted(Search):
     """A search of which it is known what its rounds find, and what of that is needed."""
 
     def __init__(self, further, needs):

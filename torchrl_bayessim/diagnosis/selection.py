@@ -14,30 +14,17 @@ __all__ = ["Selection", "select"]
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..effects.action import ActionQuantization
 from .alternatives import alternatives, exchanged, stands_in
-from .choice import chosen, fewest
-from .elimination import eliminated, without_stopgaps
-from .explanations import Round, bent, compare, explanations
-from .form_fit import with_fitted_forms, with_forms_anew
-from .further_effects import identified, no_rival, nothing_left, stands_apart
-from .little_left import all_of_little, little_left, one_alone
-from .model import LIKELY, WHITE, Model, criterion, judged, judged_fits
+from .elimination import eliminated
+from .model import LIKELY, Model, judged, judged_fits
 from .objective import Objective, Point, Unit
 from .refit import Fit
-from .rounded_commands import rounded
 from .screening import Screen
-from .shapes import with_shapes
-from .wavering import waver
+from .search import Search, exactly, with_forms_of
 
-Array = NDArray[np.float64]
-_MOST = 4  # effects in one explanation
-_UNSEEN = 1.0  # a deviance, in units of the dispersion, that no test can detect
 _AGAIN = 3  # steps of fits whose noise was another
 _EXCHANGES = 3  # of effects for others in their places
 
@@ -110,159 +97,22 @@ def select(
         progress: Told what is done.
     """
     start = judged(train, validation, [nominal])[0]
-    search = _Search(
+    again = None if known is None else partial(_anew, train, validation, known)
+    search = Search(
         train, validation, start, units,
-        known=known, varied=varied,
+        again=again, varied=varied,
         shapes=shapes, alpha=alpha, generator=generator, progress=progress,
     )  # fmt: skip
     needs = search.best()
     instead = partial(
         alternatives, train, validation,
-        units=_with_forms(search.units, needs), first=search.screens[0], offered=units,
+        units=with_forms_of(search.units, needs), first=search.screens[0], offered=units,
     )  # fmt: skip
     best, others = _settled(
         train, validation, needs, instead, tried=search.tried, progress=progress
     )
     found = tuple(search.screens), tuple(search.p_values), tuple(search.tried), others
     return Selection(start, best, *found, offered=tuple(units))
-
-
-class _Search:
-    """Rounds that each add to a model, and take out again what it does not need."""
-
-    def __init__(
-        self,
-        train: Objective,
-        validation: Objective,
-        start: Model,
-        offered: Sequence[Unit],
-        *,
-        known: Selection | None,
-        varied: bool,
-        shapes: Callable[[Point], Sequence[Unit]],
-        alpha: float,
-        generator: np.random.Generator,
-        progress: Callable[[str], None],
-    ) -> None:
-        self.sets, self.start, self.offered = (train, validation), start, offered
-        self.known, self.shapes, self.alpha, self.varied = known, shapes, alpha, varied
-        self.generator, self.progress = generator, progress
-        self.worth = no_rival if varied else _worth(start, train)
-        self.units: Sequence[Unit] = offered
-        self.tried, self.screens, self.p_values = [start], list[Screen](), list[float]()
-
-    def best(self) -> Model:
-        """Return what the data need: what is found beside less than a round had counts too."""
-        best = self.start
-        for rounds in range(1, _MOST + 1):
-            further = self._further(best)
-            found = further or best
-            if further is not None and rounds < _MOST:
-                best = found
-                continue
-            best = self._needs(found)
-            enough = nothing_left(self.start, best) or best.mean_square < WHITE
-            if enough or len(best.names) == len(found.names):
-                break
-        return best
-
-    def _further(self, best: Model) -> Model | None:
-        """Return the model with what it lacks most; nothing where it lacks nothing."""
-        train = self.sets[0]
-        self.progress(f"screening {len(self.units)} effects, round {len(self.screens) + 1}")
-        enough = nothing_left(self.start, best) and not self.varied
-        self.units = _with_forms(self.units, best)
-        left = [u for u in self.units if u not in best.units]
-        if best.units and not enough:
-            left = with_shapes(left, _beside(best, self.shapes(best.fit.point)))
-        now = compare(train, best.fit, left)
-        self.screens.append(now.seen)
-        self.p_values.append(_p_value(now.seen, best, self.generator))
-        if self.known is not None and not best.units:
-            models = _anew(*self.sets, self.known)
-            self.tried = [self.start, *models]
-            return models[0]
-        apart = not enough or stands_apart(best, now.seen, train.predictor.system.robot)
-        if not apart and not self._little(best, now.seen):
-            return None
-        # where much is left, what a first derivative does not see may still be the cause
-        if self.p_values[-1] > self.alpha and not bent(best.fit):
-            return None
-        self.progress("fitting explanations")
-        better = self._explained(
-            now,
-            partial(self._better, best, seen=now.seen)
-            if apart
-            else partial(self._all, best, left=left),
-        )
-        unknown = better is None or ActionQuantization.name in better.names
-        if best.units or self.varied or not unknown:
-            return better
-        self.progress("looking for rounded commands")
-        steps = rounded(train, best.fit, self.units)
-        stepped = None
-        if steps:
-            now = compare(train, best.fit, steps)
-            stepped = self._explained(now, partial(self._better, best, seen=now.seen))
-        found = [model for model in (better, stepped) if model is not None]
-        return min(found, key=lambda model: criterion(model, 1.0), default=None)
-
-    def _little(self, best: Model, seen: Screen) -> bool:
-        """Return whether little is left, and one effect may be all of it."""
-        dispersion = max(1.0, best.fit.mean_square)
-        little = little_left(best, self.p_values[-1], self.sets[0])
-        return little and one_alone(seen, dispersion, self.generator)
-
-    def _explained(
-        self, now: Round, best_of: Callable[[Sequence[Model]], Model | None]
-    ) -> Model | None:
-        """Return the best model with what a comparison suggests; nothing where none is worth it."""
-        models = judged(*self.sets, explanations(self.sets[0], now))
-        if self.varied:  # several at once make up for a variation that is not quite known
-            there = {unit.name for unit in now.base.units}
-            models = [model for model in models if len(model.names - there) < 2]
-        self.tried += models
-        better = best_of(models)
-        if better is None:
-            return None
-        fitted = with_fitted_forms(*self.sets, _exactly(*self.sets, better), self.offered)
-        self.tried += [better, fitted]
-        return fitted
-
-    def _better(self, best: Model, models: Sequence[Model], seen: Screen) -> Model | None:
-        """Return the best model with more than the base, if that is worth it."""
-        worth = partial(self.worth, seen=seen)
-        better = chosen(best, models)
-        better = fewest(self.sets, best, better, models, worth=worth, offered=self.offered)
-        return better if better is not None and worth(best, better, models) else None
-
-    def _all(self, best: Model, models: Sequence[Model], left: Sequence[Unit]) -> Model | None:
-        """Return the model with one effect more, if that is all of the little that is left."""
-        missing = lambda seen, model: _p_value(seen, model, self.generator) < self.alpha
-        train = self.sets[0]
-        return all_of_little(self.start, best, models, train=train, left=left, missing=missing)
-
-    def _needs(self, best: Model) -> Model:
-        """Return the model without the effects that it does not need."""
-        self.progress("taking out what is not needed")
-        needs, dropped = eliminated(*self.sets, best)
-        if len(needs.units) < len(best.units):
-            needs = with_forms_anew(*self.sets, needs, self.offered)
-        needs = without_stopgaps(*self.sets, needs, self.offered)
-        self.tried += [*dropped, needs]
-        return needs
-
-
-def _worth(start: Model, train: Objective) -> Callable[..., bool]:
-    """Return what says whether a further effect is more than a stopgap on a robot."""
-    system = train.predictor.system
-    timestep = float(system.task.model.opt.timestep)
-    told = partial(identified, start, timestep=timestep, robot=system.robot)
-
-    def worth(base: Model, better: Model, models: Sequence[Model], **seen: Any) -> bool:
-        return told(base, better, models, **seen) and not waver(base, better, train.segments)
-
-    return worth
 
 
 def _anew(train: Objective, validation: Objective, known: Selection) -> list[Model]:
@@ -294,59 +144,6 @@ def _settled(
         better = exchanged(best, others)
         if better is best or exchanges == _EXCHANGES:
             return best, others
-        best, dropped = eliminated(train, validation, _exactly(train, validation, better))
+        best, dropped = eliminated(train, validation, exactly(train, validation, better))
         tried += dropped
     return best, {}
-
-
-def _with_forms(units: Sequence[Unit], model: Model) -> list[Unit]:
-    """Return the units, those of a model with fitted forms in the places of their like."""
-    return with_shapes(units, [unit for unit in model.units if unit not in units])
-
-
-def _beside(model: Model, found: Sequence[Unit]) -> list[Unit]:
-    """Return those that the model does not have at their places already."""
-    there = {(unit.name, unit.where) for unit in model.units}
-    return [unit for unit in found if (unit.name, unit.where) not in there]
-
-
-def _exactly(train: Objective, validation: Objective, model: Model) -> Model:
-    """Fit a model with forces that follow the state at each time step, as many as can be told.
-
-    Forces that are held for 10 ms lag, and what lags looks like a delay to the next round. Where
-    something is missing still, less of it can be told: deviances count by their dispersion.
-    """
-    own = train.predictor.system.task.frame_skip
-    if train.predictor.exact and train.predictor.substeps == own:
-        return model
-    tolerated = _UNSEEN * max(1.0, model.fit.mean_square)
-
-    def exact(substeps: int) -> Array:
-        other = train.predictor.divided(substeps)
-        other.exactly(substeps)
-        return train.on(other)([model.fit.point])[0]
-
-    true = exact(own)
-    if float(((true - model.fit.innovations) ** 2).sum()) < tolerated:
-        return model
-    fewer = (n for n in range(train.predictor.substeps, own) if own % n == 0)
-    near = (n for n in fewer if float(((true - exact(n)) ** 2).sum()) < tolerated)
-    substeps = next(near, own)
-    for predictor in {train.predictor, validation.predictor}:
-        predictor.exactly(substeps)
-    return judged_fits(train, validation, [model.fit.point], iterations=4)[0]
-
-
-def _p_value(seen: Screen, model: Model, generator: np.random.Generator) -> float:
-    """Return how often noise alone would give the largest likelihood ratio of the screen."""
-    if not len(seen.units):
-        return 1.0
-    dispersion = max(1.0, model.fit.mean_square)
-    largest = float(seen.ratios(dispersion).max())
-    null = seen.null(1000, generator)
-    above = float((null >= largest).mean())
-    if above > 0.02:
-        return above
-    # beyond the draws: the tail of a maximum falls like exp(-x/2)
-    tail = np.quantile(null, 0.98)
-    return float(0.02 * np.exp(-(largest - tail) / 2))
