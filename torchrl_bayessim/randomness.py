@@ -57,7 +57,7 @@ def generator(*key: int | str) -> torch.Generator:
 def isolated(*key: int | str) -> Iterator[None]:
     """Seed the global generators of torch, NumPy and Python by ``key``, and restore them after.
 
-    Those of CUDA, too, once CUDA is in use.
+    Those of CUDA, too, if CUDA was in use before.
 
     For code that draws from the global generators and takes no other (policies and collectors of
     TorchRL, third-party distributions): inside the block its draws depend on ``key`` alone, and

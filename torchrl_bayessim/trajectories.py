@@ -71,7 +71,7 @@ def pad(trajectories: Sequence[TensorDictBase]) -> TensorDictBase:
     rows = []
     for row in trajectories:
         # the last step is repeated: finite, of the right type, and masked
-        first = next(iter(row.values(include_nested=True, leaves_only=True)))
+        first = next(iter(row.values(include_nested=True, leaves_only=True)), row)
         steps = torch.arange(longest, device=first.device)
         rows.append(row[steps.clamp_max(len(row) - 1)].set("mask", steps < len(row)))
     return TensorDict.stack(rows)  # pyright: ignore[reportReturnType]

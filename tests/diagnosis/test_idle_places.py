@@ -98,3 +98,15 @@ def test_a_model_of_fewer_effects_has_alternatives_of_its_own():
     assert [[u.name for u in m.units] for m in left.alternatives["gain"]] == [["drag"], ["push"]]
     assert set(left.alternatives) == {"gain"}
     assert len(left.tried) == 5
+
+
+@pytest.mark.parametrize(("left", "kept"), [(440.0, {"gain", "friction"}), (620.0, {"gain"})])
+def test_a_faint_effect_is_kept_where_next_to_nothing_is_left_with_it(left, kept):
+    """It removes 170 of a deviance of which 400 is noise; where more is left it may be anything."""
+    start, best = plain([], 400_000.0), plain([A, C], left)
+    tried = (start, plain([A], left + 170.0), plain([C], 399_000.0))
+    others = {"friction": (plain([A, Unit("drag")], left + 100.0),)}
+    selection = Selection(start, best, (), (0.5,), tried, others)
+    predictor = SimpleNamespace(system=SimpleNamespace(robot="robot"))
+    kept_of = worthwhile(selection, {"train": SimpleNamespace(predictor=predictor)}).best
+    assert kept_of.names == kept

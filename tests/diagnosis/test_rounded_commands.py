@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 import torch
 
+from torchrl_bayessim.diagnosis import shapes
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.objective import Unit
-from torchrl_bayessim.diagnosis.rounded_commands import steps_between
+from torchrl_bayessim.diagnosis.rounded_commands import _told_apart, steps_between
 from torchrl_bayessim.diagnosis.screening import Screen
 from torchrl_bayessim.effects.action import ActionQuantization
 from torchrl_bayessim.envs.task import Task, uniform_reset
@@ -67,14 +68,17 @@ def moved(rng, *, step, noise, rows=200):
 
 @pytest.mark.parametrize(("noise", "seed"), [((0.002, 0.02), 2), ((0.004, 0.04), 1)])
 def test_rounded_commands_are_found_between_the_strengths_that_all_effects_are_tried_at(
-    noise, seed
+    noise, seed, monkeypatch
 ):
+    # as where contacts hide what single rows do
+    monkeypatch.setattr(shapes, "_rounding", lambda *_: None)
     rng = np.random.default_rng(seed)
     logs = [moved(rng, step=STEP, noise=noise) for _ in range(6)]
     report = diagnose(arm(), None, logs)
     (found,) = report.effects
     assert (found.name, found.where) == ("action_quantization", "motor")
     assert found.strength == pytest.approx(STEP, rel=0.005)
+    assert report.verdict in {"named", "named_partial"}
 
 
 def test_steps_are_as_close_as_the_largest_command_tells_them_apart():
@@ -85,6 +89,13 @@ def test_steps_are_as_close_as_the_largest_command_tells_them_apart():
     assert (multiples * np.diff(steps) <= 0.3 * steps[:-1]).all()
     few = steps_between(0.02, 0.2, 0.0)  # nothing is commanded, nothing to tell apart
     assert len(few) < 50
+
+
+def test_of_large_commands_only_steps_are_tried_that_so_many_tell_apart():
+    few = steps_between(_told_apart(0.2, 1.0), 0.2, 1.0)
+    many = steps_between(_told_apart(0.2, 300.0), 0.2, 300.0)
+    assert len(few) == pytest.approx(600, rel=0.05)
+    assert len(many) == pytest.approx(600, rel=0.05)
 
 
 def test_a_step_is_not_scaled_by_how_much_of_its_signature_fits():

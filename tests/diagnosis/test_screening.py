@@ -6,8 +6,9 @@ import torch
 from test_diagnose import logs, run, system
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
-from torchrl_bayessim.diagnosis.objective import units_of
-from torchrl_bayessim.diagnosis.screening import Screen, _levels, crossing
+from torchrl_bayessim.diagnosis.objective import Point, Unit, units_of
+from torchrl_bayessim.diagnosis.refit import Fit
+from torchrl_bayessim.diagnosis.screening import Screen, _levels, crossing, screen
 from torchrl_bayessim.effects.catalogue import effect
 
 
@@ -83,3 +84,21 @@ def test_what_others_explain_wholly_is_left_out():
     assert not drawn(columns, columns[:, 2], ("a", "b", "c")).beside({"a", "b"}, 1.0)
     # and what explains the opposite explains nothing
     assert drawn(columns, -columns[:, 0], ("a", "b", "c")).beside({"b"}, 1.0)["a"] == 0.0
+
+
+def test_strengths_of_both_signs_are_those_that_were_asked_for():
+    """Of an offset that changes everything in proportion."""
+    unit = Unit(effect("action_bias"), "motor", (1.0,), -0.3, 0.6)
+    slope = np.arange(12.0).reshape(3, 4)
+
+    class Proportional:
+        size = 1
+
+        def __call__(self, points):
+            return np.stack([slope * point.strengths[unit] for point in points])
+
+    fit = Fit(Point(np.zeros(1)), (), np.zeros((3, 4)), np.zeros((12, 1)))
+    seen = screen(Proportional(), fit, [unit], levels=(0.02, 0.06))
+    assert len(seen.strengths) == 5  # both, their opposites, and much of the opposite
+    for strength, change in zip(seen.strengths, seen.changes, strict=True):
+        np.testing.assert_allclose(change, strength * slope, rtol=1e-5)

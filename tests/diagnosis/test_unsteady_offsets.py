@@ -155,3 +155,24 @@ def test_a_drift_alone_is_a_drift():
     )
     assert [cause.name for cause in report.effects] == ["sensor_drift"]
     assert not any("in the simulator a" in alarm for alarm in report.alarms)
+
+
+FLOATING = """
+<mujoco><worldbody><body><freejoint name="base"/><geom size=".1"/><site name="s"/>
+  <body pos="0 0 .2"><joint name="h" axis="0 1 0"/><geom size=".05" pos="0 0 .1"/></body>
+  {}</body></worldbody>
+<actuator><motor name="thrust" site="s" gear="0 0 1 0 0 0"/><motor name="m" joint="h"/></actuator>
+</mujoco>
+"""
+LEG = '<body pos="0 0 -.2"><joint name="k" axis="0 1 0"/><geom size=".05"/></body>'
+
+
+@pytest.mark.parametrize("legs", ["", LEG], ids=["one hinge", "two"])
+def test_on_a_floating_base_only_offsets_of_one_channel_are_one(legs):
+    robot = robot_of(FLOATING.format(legs))
+    tell = lambda changes: unsteady_offsets(found(changes, robot), RUNS, robot)
+    drift = {("sensor_drift", "base x"): 5}
+    assert tell({("sensor_bias", "base z"): 9} | drift) == {}
+    assert tell({("action_bias", "thrust"): 9} | drift) == {}
+    assert tell({("action_bias", "m"): 9} | drift) == {}
+    assert tell({("sensor_bias", "base x"): 9} | drift) == {"sensor_drift": "sensor_bias"}

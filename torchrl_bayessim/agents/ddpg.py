@@ -402,7 +402,9 @@ def _check_environment(env: object) -> None:
     assert isinstance(env, EnvBase)
     if env.device is not None and env.device.type != "cpu":
         expected = "an environment on the CPU, where transitions are kept, relabelled and learned"
-        raise ValueError(message(expected, f"one on {env.device}", hint='env.to("cpu"), or PPO'))
+        raise ValueError(
+            message(expected, f"one on {env.device}", hint='make it with device="cpu", or PPO')
+        )
 
 
 def _check_rewards(rewards: Any) -> None:

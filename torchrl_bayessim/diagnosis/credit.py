@@ -13,12 +13,13 @@ import numpy as np
 
 from .elimination import parts
 from .further_effects import surely_elsewhere
-from .model import Model
+from .model import WHITE, Model
 from .objective import Objective, Unit
 from .selection import Selection
 
 _LEAST = 0.005  # of the credit, to be named beside another cause
-_PLAIN, _OFF = 25.0, 0.01  # deviance that an effect removes; p-value of what is left
+_PLAIN = 25.0  # deviance that an effect removes, which chance hardly makes of any of a hundred
+_OFF = 0.01  # p-value of what is left, below which a model is off somewhere
 _MORE = 1.5  # times what is left with it, without
 
 
@@ -49,9 +50,10 @@ def worthwhile(selection: Selection, sets: Mapping[str, Objective]) -> Selection
 def _surely_needed(without: Model, selection: Selection) -> bool:
     """Return whether one of two effects is plainly needed by a model that is off nowhere."""
     best = selection.best
-    if len(best.names) != 2:  # a third one mends the forms of two others more easily
-        return False
+    if len(best.names) != 2 or best.mean_square > WHITE:
+        return False  # a third one mends the forms of two others more easily
     lost = float((without.deviances() - best.deviances()).sum()) / best.dispersion()
+    # the last p-value may be of a model that was reduced since
     return lost > _PLAIN and selection.p_values[-1] > _OFF
 
 

@@ -37,7 +37,7 @@ _SMOOTH = ViscousFriction, QuadraticDrag, ParallelSpring
 def little_left(best: Model, p_value: float, train: Objective) -> bool:
     """Return whether a model of one effect leaves little more than noise, but surely more.
 
-    Of one, since a third effect mends the forms of two others more easily. Not beside what sticks,
+    Of one, since a third effect mends the forms of two others more easily. Not beside dry
     friction, a drive that gives way or contacts, which no time step follows exactly, nor beside
     what is late, by a delay or by filters, which are forms of each other.
 

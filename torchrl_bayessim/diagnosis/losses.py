@@ -216,9 +216,9 @@ def found_beside(
 ) -> Chance | None:
     """Return the losses of a unit beside others, nothing if they do not explain what they spoil.
 
-    Commands beside an effect have to leave nothing of what they spoil, and to stand out or be many:
-    a force law that is not quite the true one errs everywhere a little, as if ever so many of them
-    were lost.
+    Commands beside an effect have to leave nothing of what they spoil, to be no more than is
+    plausible, and to stand out or to be clearly lost: a force law that is not quite the true one
+    errs everywhere a little, as if ever so many of them were.
     """
     tried, base = {name: one.tried(unit) for name, one in data.items()}, alone.law
     judged = [tried[name] for name in JUDGED]

@@ -4,8 +4,8 @@ What rounding a command u to multiples of s takes from it, :math:`s \cdot \opera
 s) - u`, at a step :math:`s (1 + \delta)` has nothing in common with that at s once :math:`\delta
 |u| / s` is half: signatures at a few strengths miss all steps between them. The course of the
 missing force shows some (:mod:`.shapes`), but not where contacts or noise hide a single row's
-command. So where nothing else explains the data, every step is simulated, from the finest on as far
-apart as the largest command allows.
+command. So where nothing else explains the data, steps are simulated as far apart as the largest
+command allows, from the finest that so many can tell apart.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 __all__ = ["rounded", "steps_between"]
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +20,12 @@ from numpy.typing import NDArray
 from ..effects.action import ActionQuantization
 from .objective import Objective, Unit, units_of
 from .refit import Fit
-from .screening import LEVELS, screen
+from .screening import screen
+from .shapes import at_step
 
 Array = NDArray[np.float64]
 _FINEST = 0.1  # of the largest step that is plausible
+_MOST = 600  # steps that are tried
 _APART = 0.25  # of a step, by which the multiple nearest to the largest command moves at most
 _FARTHEST = 0.05  # of a step, at most
 _REFINED = 2  # times, each four times as close
@@ -46,10 +47,16 @@ def rounded(train: Objective, fit: Fit, units: Sequence[Unit]) -> list[Unit]:
             continue
         column = unit.direction.index(1.0)
         largest = float(np.abs(train.segments.ctrl[..., column]).max())
-        step = _best(train, fit, unit, steps_between(_FINEST * unit.high, unit.high, largest))
-        if step is not None:  # the screen's higher level is the step itself
-            found.append(replace(unit, high=step / LEVELS[-1]))
+        least = max(_FINEST * unit.high, _told_apart(unit.high, largest))
+        step = _best(train, fit, unit, steps_between(least, unit.high, largest))
+        if step is not None:
+            found.append(at_step(unit, step))
     return found
+
+
+def _told_apart(most: float, largest: float) -> float:
+    """Return from which step on so many tell all steps apart, ``n = (1/s - 1/most) largest/a``."""
+    return 1 / (1 / most + _MOST * _APART / max(largest, most))
 
 
 def steps_between(least: float, most: float, largest: float) -> Array:

@@ -205,9 +205,10 @@ def screen(
         objective: What to explain.
         fit: What is in the model already; its units are projected out like parameters.
         units: The effects to try.
-        levels: Strengths to try, as shares of a unit's range; default those that suit it.
+        levels: Strengths to try, as positive shares of a unit's range; default those that suit it.
     """
-    rows = [(unit, level * unit.high) for unit in units for level in levels or _levels(unit)]
+    shares = {unit: _levels(unit) if levels is None else levels for unit in units}
+    rows = [(unit, level * unit.high) for unit in units for level in shares[unit]]
     rows += [(unit, LEVELS[-1] * unit.low) for unit in units if unit.low < 0]
     strengths = fit.point.strengths
     changes, wild = [], []
@@ -224,7 +225,7 @@ def screen(
             changes.append(np.zeros_like(change) if wild[-1] else change)
     # little of an effect does the opposite of as little of its opposite
     small = [i for i, (unit, level) in enumerate(rows) if unit.low < 0 < level < unit.high / 10]
-    rows += [(rows[i][0], LEVELS[0] * rows[i][0].low) for i in small]
+    rows += [(unit, level / unit.high * unit.low) for unit, level in [rows[i] for i in small]]
     changes += [changes[i] * np.float32(rows[i][0].low / rows[i][0].high) for i in small]
     wild += [wild[i] for i in small]
     return _compared(rows, changes, fit, objective.size, wild=np.array(wild))

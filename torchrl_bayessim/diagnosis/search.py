@@ -25,6 +25,7 @@ from .further_effects import identified, no_rival, nothing_left, stands_apart
 from .little_left import all_of_little, little_left, one_alone
 from .model import WHITE, Model, criterion, judged, judged_fits
 from .objective import Objective, Point, Unit
+from .refit import refit
 from .rounded_commands import rounded
 from .screening import Screen
 from .shapes import with_shapes
@@ -124,13 +125,18 @@ class Search:
             else partial(self._all, best, left=left),
         )
         unknown = better is None or ActionQuantization.name in better.names
-        if best.units or self.varied or not unknown:
+        return self._or_rounded(best, better) if unknown and not best.units else better
+
+    def _or_rounded(self, best: Model, better: Model | None) -> Model | None:
+        """Return the better model, or one with commands that are rounded to a step of their own."""
+        if self.varied:
             return better
         self.progress("looking for rounded commands")
-        steps = rounded(train, best.fit, self.units)
-        stepped = None
+        # what was found may have forces that are followed more closely since
+        base = refit(self.sets[0], [best.fit.point], iterations=0)[0]
+        steps, stepped = rounded(self.sets[0], base, self.units), None
         if steps:
-            now = compare(train, best.fit, steps)
+            now = compare(self.sets[0], base, steps)
             stepped = self._explained(now, partial(self._better, best, seen=now.seen))
         found = [model for model in (better, stepped) if model is not None]
         return min(found, key=lambda model: criterion(model, 1.0), default=None)

@@ -11,7 +11,7 @@ that differ a little have nothing in common.
 
 from __future__ import annotations
 
-__all__ = ["SHAPED", "shaped", "with_shapes"]
+__all__ = ["SHAPED", "at_step", "shaped", "with_shapes"]
 
 import math
 from collections.abc import Sequence
@@ -91,9 +91,14 @@ def shaped(
         if joint < 0 or column is None or unit.where == "all":
             continue
         step = _rounding(force[:, column], ctrl[..., actuator], unit.high)
-        if step is not None:  # the screen's higher level is the step itself
-            units.append(replace(unit, high=step / LEVELS[-1]))
+        if step is not None:
+            units.append(at_step(unit, step))
     return units
+
+
+def at_step(unit: Unit, step: float) -> Unit:
+    """Return rounded commands of which the screen's higher level is the step itself."""
+    return replace(unit, high=step / LEVELS[-1])
 
 
 def _missing(

@@ -80,7 +80,7 @@ def unsteady_offset_alarms(told: Mapping[str, str]) -> list[str]:
 
 
 def unrepeated_alarms(model: Model, segments: Segments, told: Mapping[str, str]) -> list[str]:
-    """Return an alarm if a wave is named that no run is long enough to see repeat.
+    """Return an alarm if a wave is named that no run of the fit is long enough to see repeat.
 
     Args:
         model: With the effects that were found.
@@ -90,7 +90,9 @@ def unrepeated_alarms(model: Model, segments: Segments, told: Mapping[str, str])
     name = PeriodicDisturbance.name
     if name in told or not _unrepeated(model, segments):
         return []
-    return [f"no run holds two periods of the {plain(name)}: it may be any force that changes"]
+    return [
+        f"no run of the fit holds two periods of the {plain(name)}: it may be any force that changes"
+    ]
 
 
 def _unrepeated(model: Model, segments: Segments) -> bool:
@@ -128,11 +130,14 @@ def _parts(
     return {name: wholes.pop()} if len(wholes) == 1 else {}
 
 
-def _joints(unit: Unit, robot: Robot) -> set[int]:
-    """Return the joints at which a unit acts, -1 for all together if it is of none of several."""
-    if len(robot.joints) == 1:
+def _joints(unit: Unit, robot: Robot) -> set[int | str]:
+    """Return the joints at which a unit acts, or its targets by name where those are at none."""
+    if len(robot.joints) == 1 and -1 not in robot.channel_joint:
         return {0}  # a tilt, too
-    return {unit.effect.joint(robot, at) for at, part in enumerate(unit.direction) if part}
+    targets = unit.effect.targets(robot)
+    places = [at for at, part in enumerate(unit.direction) if part]
+    joints = {at: unit.effect.joint(robot, at) for at in places}
+    return {targets[at] if joint < 0 else joint for at, joint in joints.items()}
 
 
 def _size(model: Model, unit: Unit) -> float:

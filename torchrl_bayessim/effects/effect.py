@@ -93,7 +93,7 @@ class Effect(ABC):
         search_power: Searches and fits count strengths by ``(s / s_max)^(1 / power)``: 2 where
             what shows is a period and ``s`` its square, so that fast ones are told apart too.
         graded: Whether twice the strength does about twice as much, so that searches may scale it:
-            of a step to which something is rounded it does not.
+            the step to which commands are rounded does not.
         nuisances: Options of `free` of which no value is the usual one: fitted like strengths, and
             what is not known of them widens the intervals of strengths in any case.
         placed: Options of `free` that are read off the data before the effect is offered, such as

@@ -33,5 +33,5 @@ def check_one_device(devices: Iterable[torch.device]) -> None:
     """
     found = sorted(set(map(str, devices)))
     if len(found) > 1:
-        expected = "networks on one device, since their answers are averaged there"
+        expected = "networks on one device, since they share pairs, or their answers"
         raise ValueError(message(expected, " and ".join(found), hint=f"network.to({found[0]!r})"))
