@@ -90,9 +90,8 @@ def unrepeated_alarms(model: Model, segments: Segments, told: Mapping[str, str])
     name = PeriodicDisturbance.name
     if name in told or not _unrepeated(model, segments):
         return []
-    return [
-        f"no run of the fit holds two periods of the {plain(name)}: it may be any force that changes"
-    ]
+    wave = plain(name)
+    return [f"no run of the fit holds two periods of the {wave}: it may be any force that changes"]
 
 
 def _unrepeated(model: Model, segments: Segments) -> bool:
