@@ -16,9 +16,10 @@ The effects on the noise of a sensor are part of the noise floor, and so left ou
 counts::
 
     python recipes/benchmarks/each_effect.py [hopper=1] [two_links=1] [cartpole=1] [percent=50]
-        [places=1] [seed=0]
+        [places=1] [seed=0] [action_quantization ...]
 
-``places`` is the number of targets per effect; ``hopper=0`` leaves Hopper out.
+``places`` is the number of targets per effect; ``hopper=0`` leaves Hopper out; names of effects
+leave out the others.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,6 +50,7 @@ from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.envs.task import Task, uniform_reset
 from torchrl_bayessim.envs.tasks.catalogue import known_task
 from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.kinds import check_choice
 from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.read import read_logs
 from torchrl_bayessim.logs.simulators import simulator_task
@@ -126,11 +128,11 @@ def commands(system: System, amplitude: float, *, seed: int) -> torch.Tensor:
 
 
 def cases(
-    name: str, task: Task, *, share: float, places: int, seed: int
+    name: str, task: Task, *, share: float, places: int, seed: int, only: Collection[str] = ()
 ) -> Iterator[tuple[System, Effect, str, float]]:
     """Return for each effect that applies the described system, a place and a strength."""
     for kind in CATALOGUE.values():
-        if kind.name in FLOOR:
+        if kind.name in FLOOR or (only and kind.name not in only):
             continue
         bounds = (DAMPINGS if kind.group in LIKE_MASSES else MASSES)[name]
         system = System(task=task, physics=MujocoPhysics(*bounds), prior=BoxPrior(bounds))
@@ -158,9 +160,11 @@ def outcome(report: Report, name: str, where: str, strength: float) -> str:
 
 def main(*arguments: str) -> None:
     """Diagnose one robot per effect and simulator."""
-    known = simulators()
+    known, only = simulators(), [argument for argument in arguments if "=" not in argument]
+    for name in only:
+        check_choice("an effect", name, list(CATALOGUE))
     given = options(
-        list(arguments),
+        [argument for argument in arguments if "=" in argument],
         optional=[*known, "seed"],
         **dict.fromkeys(known, 1),
         percent=50,
@@ -172,9 +176,8 @@ def main(*arguments: str) -> None:
     for name, task in known.items():
         if not given[name]:
             continue
-        every = cases(
-            name, task, share=given["percent"] / 100, places=given["places"], seed=given["seed"]
-        )
+        share, some = given["percent"] / 100, {n: given[n] for n in ("places", "seed")}
+        every = cases(name, task, share=share, only=only, **some)
         for system, effect, where, strength in every:
             logs = recorded(system, name, effect, {where: strength}, seed=given["seed"])
             begun = time.perf_counter()

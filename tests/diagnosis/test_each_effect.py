@@ -41,9 +41,13 @@ def test_an_effect_that_is_overlooked_is_missed(benchmark, monkeypatch, capsys):
     monkeypatch.setattr(
         benchmark, "diagnose", lambda *given: diagnose(*given, effects=["sensor_drift"])
     )
-    monkeypatch.setattr(benchmark, "CATALOGUE", {"quadratic_drag": CATALOGUE["quadratic_drag"]})
-    benchmark.main("hopper=0", "cartpole=0")
+    benchmark.main("hopper=0", "cartpole=0", "quadratic_drag")
     line, total = map(json.loads, capsys.readouterr().out.splitlines())
     assert line["value"] == "missed"
     assert line["verdict"] in {"unknown", "none"}
     assert total["value"] == {"missed": 1}
+
+
+def test_an_effect_that_is_none_is_refused(benchmark):
+    with pytest.raises(ValueError, match=r"an effect.*drag.*quadratic_drag"):
+        benchmark.main("drag")
