@@ -4,6 +4,7 @@ import copy
 
 import pytest
 import torch
+from on_gpu import GPU, NEEDS_GPU
 from tensordict import TensorDict
 
 from torchrl_bayessim import BoxPrior, GaussianPrior, MixtureDensityPosterior, fit
@@ -21,12 +22,7 @@ from torchrl_bayessim.inference.widening import learn_shared, widen
 from torchrl_bayessim.randomness import generator
 from torchrl_bayessim.sources import draw
 
-pytestmark = [
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
-    pytest.mark.filterwarnings("ignore:Attempting to run cuBLAS"),  # torch's, of its threads
-]
-
-GPU = torch.device("cuda:0")
+pytestmark = NEEDS_GPU
 BOX = BoxPrior({"mass": (2.0, 6.0), "damping": (0.01, 1.0)}, log=["damping"])
 NORMAL = GaussianPrior(
     {"mass": (4.0, 0.5), "offset": (0.0, 0.1)}, correlation=torch.tensor([[1.0, 0.6], [0.6, 1.0]])

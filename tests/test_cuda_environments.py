@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from on_gpu import GPU, NEEDS_GPU
 from torchrl.envs import Compose, StepCounter, TransformedEnv
 
 from torchrl_bayessim import (
@@ -35,12 +36,7 @@ from torchrl_bayessim.summaries import (
 )
 from torchrl_bayessim.trajectories import pad
 
-pytestmark = [
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
-    pytest.mark.filterwarnings("ignore:Attempting to run cuBLAS"),  # torch's, of its threads
-]
-
-GPU = torch.device("cuda:0")
+pytestmark = NEEDS_GPU
 BOX = BoxPrior({"length": (0.1, 2.0), "masspole": (0.1, 2.0)})
 FIT = {"epochs": 4, "progress": False}
 

@@ -5,6 +5,7 @@ import io
 
 import pytest
 import torch
+from on_gpu import GPU, NEEDS_GPU
 from torch.distributions import Independent, Uniform
 
 from torchrl_bayessim import (
@@ -27,12 +28,7 @@ from torchrl_bayessim.inference.proposals import (
 from torchrl_bayessim.randomness import generator, isolated
 from torchrl_bayessim.sources import Defensive, Empirical, draw
 
-pytestmark = [
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
-    pytest.mark.filterwarnings("ignore:Attempting to run cuBLAS"),  # torch's, of its threads
-]
-
-GPU = torch.device("cuda:0")
+pytestmark = NEEDS_GPU
 BOX = BoxPrior({"length": (0.1, 2.0), "masspole": (0.1, 2.0)})
 NORMAL = GaussianPrior({"length": (1.0, 0.2), "masspole": (1.0, 0.2)})
 PRIORS = pytest.mark.parametrize("prior", [BOX, NORMAL], ids=["box", "normal"])

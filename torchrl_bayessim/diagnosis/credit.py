@@ -13,7 +13,7 @@ import numpy as np
 
 from .elimination import parts
 from .further_effects import surely_elsewhere
-from .model import WHITE, Model
+from .model import WHITE, Model, total_gain
 from .objective import Objective, Unit
 from .selection import Selection
 
@@ -52,9 +52,8 @@ def _surely_needed(without: Model, selection: Selection) -> bool:
     best = selection.best
     if len(best.names) != 2 or best.mean_square > WHITE:
         return False  # a third one mends the forms of two others more easily
-    lost = float((without.deviances() - best.deviances()).sum()) / best.dispersion()
     # the last p-value may be of a model that was reduced since
-    return lost > _PLAIN and selection.p_values[-1] > _OFF
+    return total_gain(without, best) > _PLAIN and selection.p_values[-1] > _OFF
 
 
 def _apart(selection: Selection, sets: Mapping[str, Objective]) -> Selection:

@@ -25,7 +25,7 @@ import numpy as np
 from ..effects.action import ActionDelay
 from ..effects.robot import Robot
 from ..effects.sensors import SensorDelay
-from .model import LIKELY, Model, as_good, gain
+from .model import LIKELY, Model, as_good, gain, total_gain
 from .objective import Unit
 from .screening import Screen
 
@@ -142,7 +142,7 @@ def surely_elsewhere(base: Model, better: Model, robot: Robot) -> bool:
 
     The model has to leave noise alone: one that is off everywhere needs whatever mends some of it.
     """
-    lost = float((base.deviances() - better.deviances()).sum()) / better.dispersion()
+    lost = total_gain(base, better)
     places = _places_of(base, robot)
     apart = any(not _places(unit, robot) <= places for unit in better.beyond(base))
     return apart and lost > _PLAIN and better.mean_square < _VISIBLE

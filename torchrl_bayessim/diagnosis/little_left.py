@@ -21,7 +21,7 @@ from ..effects.joints import CoulombFriction, ParallelSpring, ViscousFriction
 from .choice import chosen
 from .explanations import compare
 from .further_effects import no_rival, numerical
-from .model import WHITE, Model
+from .model import WHITE, Model, total_gain
 from .objective import Objective, Unit
 from .screening import Screen
 from .wavering import waver
@@ -93,8 +93,7 @@ def all_of_little(
     if better is None:
         return None
     timestep = float(train.predictor.system.task.model.opt.timestep)
-    lost = float((best.deviances() - better.deviances()).sum()) / better.dispersion()
-    if lost < _PLAIN or numerical(start, best, better, timestep):
+    if total_gain(best, better) < _PLAIN or numerical(start, best, better, timestep):
         return None
     others = [unit for unit in left if unit.name not in better.names]
     if not no_rival(best, better, single) or waver(best, better, train.segments):

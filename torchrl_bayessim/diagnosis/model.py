@@ -16,6 +16,7 @@ __all__ = [
     "numbers",
     "price",
     "shown",
+    "total_gain",
 ]
 
 from collections.abc import Iterable, Sequence, Set
@@ -125,6 +126,11 @@ def gain(base: Model, model: Model) -> float:
     """Return how much better the validation segments are explained, in units of the noise."""
     before, after = (float((m.validation**2).sum()) for m in (base, model))
     return (before - after) / model.dispersion()
+
+
+def total_gain(base: Model, model: Model) -> float:
+    """Return how much better all segments are explained, in units of the noise."""
+    return float((base.deviances() - model.deviances()).sum()) / model.dispersion()
 
 
 def needed(base: Model, model: Model) -> float:
