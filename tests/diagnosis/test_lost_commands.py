@@ -14,8 +14,12 @@ from test_lost_values import TWO, run_of_two
 
 from torchrl_bayessim.diagnosis.arrivals import Arrivals
 from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.evident_losses import _likely, evident
 from torchrl_bayessim.diagnosis.loss_law import LossLaw
-from torchrl_bayessim.diagnosis.losses import _apart, _sensed, evident
+from torchrl_bayessim.diagnosis.loss_segments import loss_segments
+from torchrl_bayessim.diagnosis.loss_suspects import Alone
+from torchrl_bayessim.diagnosis.losses import _sensed
+from torchrl_bayessim.diagnosis.losses import apart as may_be_beside
 from torchrl_bayessim.diagnosis.lost_commands import _matters, _searched, beside_lost_commands
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.preparation import prepare
@@ -166,19 +170,42 @@ def test_beside_losses_that_were_found_alone_more_is_looked_for(monkeypatch, bes
     """However little of what is wrong with their segments they explain."""
     (unit,) = units_of([PacketDrop()], system().robot)
     law = SimpleNamespace(deviance=lambda _: 95.0)
-    monkeypatch.setattr("torchrl_bayessim.diagnosis.losses.likeliest", lambda *_, **__: law)
-    monkeypatch.setattr("torchrl_bayessim.diagnosis.losses._plain", lambda *_: False)
+    monkeypatch.setattr("torchrl_bayessim.diagnosis.evident_losses.likeliest", lambda *_, **__: law)
+    monkeypatch.setattr("torchrl_bayessim.diagnosis.evident_losses._plain", lambda *_: False)
     segments = SimpleNamespace(tried=lambda _: None, point=Point(np.zeros(1)))
     data = {"train": segments, "validation": segments}
     alone = SimpleNamespace(law=SimpleNamespace(size=16), costs=[60.0, 40.0])
     suspects = SimpleNamespace(units=[unit], nominal=data, best=data, alone=alone, rival=alone)
     selection = SimpleNamespace(best=plain([], 1e3))
     found = [] if beside is None else [SimpleNamespace(unit=unit, beside=beside)]
-    seen = evident(suspects, selection, found)
+    sought = SimpleNamespace(suspects=suspects, selection=selection, found=found)
+    seen = evident(sought, None)
     assert (seen is not None) == searched
     if seen is not None:
         assert seen.unit is unit
         assert seen.without == 100.0
+
+
+@pytest.mark.parametrize(("share", "off", "there"), [(0.3, 1.5, True), (0.0, 0.7, False)])
+def test_losses_are_plain_once_parameters_are_fitted_to_commands_that_arrived(share, off, there):
+    """Of an arm whose parameters had made up for them as far as they could, and were far off."""
+    act, _ = jumps(share, 3)
+    units = units_of([PacketDrop()], system().robot)
+    generator = np.random.default_rng(0)
+    prepared = prepare(system(), logs(6, act=act), units, generator=generator)
+    bent = prepared.nominal.point.z + off
+    data = {name: one.at(Point(bent)) for name, one in loss_segments(prepared).items()}
+    suspects = SimpleNamespace(units=units, nominal=data, alone=Alone.of(data))
+    assert not _likely(data, units[0], suspects.alone).plain
+    found = SimpleNamespace(best=plain([], 1e3))
+    sought = SimpleNamespace(suspects=suspects, selection=found, found=[], generator=generator)
+    seen = evident(sought, prepared)
+    assert (seen is not None) == there
+    if seen is not None:
+        assert seen.law.share == pytest.approx(share, rel=0.4)
+        unspoiled = prepare(system(), logs(6, act=jumps(0.0, 3)[0]), units, generator=generator)
+        right = unspoiled.nominal.point.z
+        assert np.linalg.norm(seen.point.z - right) < 0.4 * np.linalg.norm(bent - right)
 
 
 @pytest.mark.parametrize(
@@ -187,7 +214,8 @@ def test_beside_losses_that_were_found_alone_more_is_looked_for(monkeypatch, bes
         ([(6.2, 4.3, A), (4.2, 1.8, A), (3.7, 1.5, A)], 1.5),  # better decisions each time
         ([(6.2, 1.8, A), (4.2, 2.0, A)], 1.8),
         ([(6.2, 4.3, A), (4.2, 4.0, A), (4.1, 3.9, A)], None),  # in the end it mends a little
-        ([(6.2, 6.2, None)], None),
+        ([(6.2, 6.2, None)], 6.2),  # losses are all there is
+        ([(6.2, 4.3, A), (4.2, 4.2, None)], 4.2),
     ],
 )
 def test_which_commands_arrived_is_decided_on_again_while_that_helps(monkeypatch, found, last):
@@ -223,6 +251,6 @@ def test_losses_are_not_told_beside_what_errs_as_they_do(name, apart, sensed):
         units_of([effect(random)], system().robot)[0]
         for random in ("packet_drop", "sensor_dropout")
     )
-    assert _apart(commands, units) == apart
-    assert _apart(samples, units)  # but clearly, beside what errs as they do
+    assert may_be_beside(commands, units) == apart
+    assert may_be_beside(samples, units)  # but clearly, beside what errs as they do
     assert _sensed(units) == sensed  # where they have to be clear

@@ -10,10 +10,10 @@ place of the effects that the search found, and beside them.
 
 from __future__ import annotations
 
-__all__ = ["Evident", "evident", "found_beside", "losses", "lost_beside"]
+__all__ = ["CLEAR", "SHARES", "WRONG", "apart", "found_beside", "losses"]
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from ..effects.contacts import ContactFriction
 from ..effects.sensors import SensorBias
 from .chance import Chance
 from .contacts import resting
-from .loss_law import LossLaw, Told, Tried, likeliest
+from .loss_law import LossLaw, Told, likeliest
 from .loss_segments import LossSegments
 from .loss_suspects import (
     FEWEST,
@@ -37,13 +37,12 @@ from .loss_suspects import (
     Suspects,
     spoiled_share,
 )
-from .model import Model
-from .objective import Point, Unit
+from .objective import Unit
 from .preparation import Prepared
 from .selection import Selection
 
 Array = NDArray[np.float64]
-_SHARES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.25, 0.4, 0.6)  # s
+SHARES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.25, 0.4, 0.6)  # s
 # deviances: to be found (contacts that come late look like a few losses), and that chance makes
 _NEEDED, _LIKELY = 40.0, 6.0
 _EXPLAINED = 0.5  # of the excess of the segments concerned, by what is left of them
@@ -53,91 +52,10 @@ _FEW = 0.1  # of the deviance that such losses explain: what they may cost in ru
 _BIASED = 0.1  # of the excess of the segments concerned, which parameters leave in all
 _OTHERS = 1 / 6  # of the segments that something else may have spoiled
 _REMAIN = 0.6  # or of those that were spoiled without losses
-# to be evident, whatever else is wrong: deviance, errors without losses per those with them, and
-# segments that losses do not explain
-_EVIDENT, _TIMES, _WRONG = 100.0, 4.0, 0.3
+CLEAR, WRONG = 100.0, 0.3  # deviance of what is clear, and segments that losses do not explain
 _LATE = ActionDelay.group
 _INTERVAL = 3.92  # standard deviations that are 95 %
 _WIDER = 1.5  # times: errors were, on robots whose share was known
-
-
-@dataclass(frozen=True, eq=False)
-class Evident:
-    """Losses of commands that are there, whatever else is.
-
-    Attributes:
-        unit: Whose commands.
-        law: How they come about.
-        point: The simulator in which they are likeliest.
-        without: Deviance of the best explanation without losses.
-        segments: Of each split, with the commands as they were sent, at the nominal fit.
-    """
-
-    unit: Unit
-    law: LossLaw
-    point: Point
-    without: float
-    segments: Mapping[str, LossSegments]
-
-    @property
-    def actuators(self) -> list[int]:
-        """Those whose commands are lost together."""
-        return np.flatnonzero(self.unit.direction).tolist()
-
-
-def evident(suspects: Suspects, selection: Selection, found: Sequence[Chance]) -> Evident | None:
-    """Return the likeliest losses of commands, if segments are much likelier with any.
-
-    Or those that were found in the place of effects that last.
-
-    Args:
-        suspects: Short segments.
-        selection: What the search without chance found.
-        found: What was found of losses.
-    """
-    known = {one.unit for one in found if not one.beside}
-    nominal, best, rival = suspects.nominal, suspects.best, suspects.rival
-    some = [u for u in suspects.units if isinstance(u.effect, PacketDrop)]
-    bases = [(nominal, suspects.alone), *([(best, rival)] if selection.best.units else [])]
-    likely: tuple[float, Evident] | None = None
-    for data, alone in bases:
-        for unit in some:
-            judged = [data[name].tried(unit) for name in JUDGED]
-            scatters = SCATTER.tolist()
-            law = likeliest(judged, _SHARES, scatters, SPOILED, size=alone.law.size)
-            cost = law.deviance(judged)
-            gained = sum(alone.costs) - cost
-            plain = unit in known or (gained > _EVIDENT and _plain(law, judged))
-            if plain and (likely is None or cost < likely[0]):
-                least = min(sum(other.costs) for _, other in bases)
-                likely = cost, Evident(unit, law, data[JUDGED[0]].point, least, nominal)
-    return None if likely is None else likely[1]
-
-
-def _plain(law: LossLaw, judged: Sequence[Tried]) -> bool:
-    """Return whether losses explain nearly all that is wrong with the segments that have them.
-
-    And whether most segments are right with them: another law than the true one is wrong
-    everywhere, and some of that looks like losses.
-    """
-    told = Told.joined([law.told(one) for one in judged])
-    concerned = told.lost > LIKELIER
-    if concerned.sum() < FEWEST or spoiled_share(told) > _WRONG:
-        return False
-    return bool(told.before[concerned].mean() > _TIMES * told.after[concerned].mean())
-
-
-def lost_beside(seen: Evident, model: Model) -> Chance | None:
-    """Return losses of commands beside the effects of a model, nothing if they may be those.
-
-    Args:
-        seen: The losses that are evident, in segments with the commands that were sent.
-        model: The effects.
-    """
-    if not _apart(seen.unit, model.units):
-        return None
-    data = {name: one.at(model.fit.point) for name, one in seen.segments.items()}
-    return found_beside(data, seen.unit, Alone.of(data), model.units)
 
 
 def losses(prepared: Prepared, selection: Selection, suspects: Suspects) -> list[Chance]:
@@ -156,7 +74,7 @@ def losses(prepared: Prepared, selection: Selection, suspects: Suspects) -> list
     alone = suspects.alone
     # what the best explanation without chance gains by the same standard
     found, least = _all_found(nominal, some, alone), sum(alone.costs) - sum(rival.costs)
-    able = [unit for unit in some if _apart(unit, selection.best.units)]
+    able = [unit for unit in some if apart(unit, selection.best.units)]
     if selection.best.units and able:
         others = _all_found(best, able, rival, selection.best.units)
         beside = [replace(one, beside=True) for one in others]
@@ -175,7 +93,7 @@ def _telling(prepared: Prepared, units: Sequence[Unit]) -> list[Unit]:
     return [u for u in units if isinstance(u.effect, PacketDrop) or not rests[u.direction.index(1)]]
 
 
-def _apart(unit: Unit, others: Sequence[Unit]) -> bool:
+def apart(unit: Unit, others: Sequence[Unit]) -> bool:
     """Return whether losses beside effects could not be another form of those.
 
     A lag that is not quite the true one errs as commands would that were lost, and contacts that
@@ -223,7 +141,7 @@ def found_beside(
     tried, base = {name: one.tried(unit) for name, one in data.items()}, alone.law
     judged = [tried[name] for name in JUDGED]
     scatters = [s for s in SCATTER.tolist() if s <= base.scatter][-3:]
-    law = likeliest(judged, _SHARES, scatters, SPOILED, size=base.size)
+    law = likeliest(judged, SHARES, scatters, SPOILED, size=base.size)
     gains = [cost - law.deviance([one]) for cost, one in zip(alone.costs, judged, strict=True)]
     if sum(gains) < _NEEDED:
         return None
@@ -263,7 +181,7 @@ def _explain(
     before, after = (
         float((e[concerned] - law.scatter).mean()) for e in (known.before, known.after)
     )
-    clear = sum(gains) > _EVIDENT and after < _CLEARLY * before
+    clear = sum(gains) > CLEAR and after < _CLEARLY * before
     if _sensed(others) and not clear:
         return False
     surely = bool(others) and clear
@@ -272,7 +190,7 @@ def _explain(
         return False
     # parameters that were fitted without losses are a little off everywhere
     noise = max(NOISE, min(LEFT, 1.0 + _BIASED * before))
-    spoiled = max(_OTHERS, _REMAIN * alone.spoiled, _WRONG if surely else 0.0)
+    spoiled = max(_OTHERS, _REMAIN * alone.spoiled, WRONG if surely else 0.0)
     if law.scatter > noise or spoiled_share(known) > spoiled:
         return False  # something else is wrong everywhere, and may look like this
     if after > _EXPLAINED * before:

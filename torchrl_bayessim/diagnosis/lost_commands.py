@@ -20,7 +20,7 @@ from .arrivals import Arrivals
 from .beside_losses import CERTAIN, Beside, Sought
 from .chance import Chance
 from .elimination import parts
-from .losses import Evident, evident, lost_beside
+from .evident_losses import Evident, evident, lost_beside
 from .model import WHITE
 from .preparation import Prepared
 from .prepared_anew import with_other_logs
@@ -36,7 +36,8 @@ _SIMULATED = 18  # for each row and actuator
 def beside_lost_commands(sought: Sought) -> Beside | None:
     """Return effects that last and losses that explain more together than what was found."""
     prepared, selection, found = sought.prepared, sought.selection, sought.found
-    seen = evident(sought.suspects, selection, found)
+    some = _fewer(prepared, prepared.predictor.system.task.model.nu)
+    seen = evident(sought, some)
     if seen is None:
         return None
     some = _fewer(prepared, len(seen.actuators))
@@ -44,11 +45,13 @@ def beside_lost_commands(sought: Sought) -> Beside | None:
     if best is None:
         return None
     lasting, chance = _needed(seen, *best)
+    if found and not lasting.best.units:
+        return None  # losses alone explain it with the commands that were sent
     if chance is None or chance.deviance > seen.without - CERTAIN:
         return None
     if any(chance.deviance > one.deviance - CERTAIN for one in found):
         return None
-    return Beside(some, best[0], lasting, replace(chance, beside=True))
+    return Beside(some, best[0], lasting, replace(chance, beside=bool(lasting.best.units)))
 
 
 def _needed(
@@ -107,9 +110,11 @@ def _searched(
         logs = Arrivals(prepared, point, seen.actuators, law).decided(logs)
         again = with_other_logs(prepared, logs, generator=generator)
         again, selection = search(again)
-        if not selection.best.units or selection.best.mean_square >= least:
+        if selection.best.mean_square >= least:
             break
         least, point = selection.best.mean_square, selection.best.fit.point
+        if not selection.best.units:
+            return result or (again, selection)
         if _matters(selection):  # or decisions in this simulator may be better ones
             result = again, selection
         if least < WHITE:

@@ -33,6 +33,7 @@ from .refit import Fit, refit
 Array = NDArray[np.float64]
 LIKELY = 6.0  # a deviance that chance often makes
 _CHANCE = 0.01  # of a test that two models explain the data equally well
+_NEXT_TO_NOTHING = 0.03  # of what all runs of the fit gain
 _WORSE = 1.5  # times the misfit of the best model: too much for an equal, however few the data
 _CERTAIN, _SEVERAL = 5.0, 2  # times what judging runs must gain; runs of the fit that gain it
 WHITE = 1.2  # mean squared innovation of a model that leaves noise alone
@@ -141,8 +142,8 @@ def needed(base: Model, model: Model) -> float:
 def shown(base: Model, model: Model) -> bool:
     """Return whether segments that no fit saw show that a model is better than its base.
 
-    Or those of several runs of the fit, beyond doubt, if the others do not disagree: what shows in
-    some motions only need not be in the runs that judge.
+    Or those of several runs of the fit, beyond doubt, if the others do not disagree, or by next to
+    nothing: what shows in some motions only need not be in the runs that judge.
     """
     if gain(base, model) > needed(base, model):
         return True
@@ -153,7 +154,7 @@ def shown(base: Model, model: Model) -> bool:
     better = (base.deviances() - model.deviances())[:count] / model.dispersion()
     each = np.bincount(logs, better)
     runs = int((each > _CERTAIN * needed(base, model)).sum())
-    return runs >= _SEVERAL and not (each < -LIKELY).any()
+    return runs >= _SEVERAL and not (each < -max(LIKELY, _NEXT_TO_NOTHING * each.sum())).any()
 
 
 def as_good(best: Model, rival: Model) -> bool:

@@ -60,8 +60,8 @@ class Sent:
 
     Attributes:
         raw: At the prior's mean.
-        refit: With fitted parameters.
-        effects: With the effects that last too.
+        refit: With parameters that were fitted to these.
+        effects: With the effects that last, and parameters that were fitted beside them.
         lost: How many commands, or samples, of all runs are taken to have been lost.
         of: How many there are.
         samples: Whether they are samples.
@@ -83,7 +83,7 @@ class Sent:
             sent: The same runs with those that were sent.
             selection: What was found.
         """
-        test, nominal = prepared.sets["test"], selection.nominal.fit.point
+        test, nominal = prepared.sets["test"], sent.nominal.point
         size, history = len(test.segments), test.segments.history
         pieces = prepared.mode.cut(sent.logs["test"], prepared.horizon, history=history, most=size)
         points = [Point(np.zeros_like(nominal.z)), nominal, selection.best.fit.point]

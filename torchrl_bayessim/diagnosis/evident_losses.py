@@ -1,0 +1,163 @@
+"""Losses of commands that are there whatever else is wrong with the simulator.
+
+They explain nearly all that is wrong with the segments that have them, and most segments are right
+with them. Where many commands are lost the parameters make up for some of that, and nothing is
+right: then parameters and effects are fitted again on the commands that are likely to have arrived
+(`arrivals`), which these are is told again in that simulator, and so on while losses get likelier:
+expectation maximization (Dempster, Laird & Rubin 1977) with the likeliest arrivals in the place of
+their expectation.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Evident", "evident", "lost_beside"]
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ..effects.action import PacketDrop
+from .arrivals import Arrivals
+from .beside_losses import CERTAIN, Sought
+from .chance import Chance
+from .loss_law import LossLaw, Told, Tried, likeliest
+from .loss_segments import LossSegments
+from .loss_suspects import FEWEST, JUDGED, LIKELIER, SCATTER, SPOILED, Alone, spoiled_share
+from .losses import CLEAR, SHARES, WRONG, apart, found_beside
+from .model import Model
+from .objective import Point, Unit
+from .preparation import Prepared
+from .prepared_anew import with_other_logs
+from .refit import refit
+
+_TIMES = 4.0  # errors without losses per those with them
+_ROUNDS = 4  # of fitting again
+_AGAIN = 6  # steps of these fits
+
+
+@dataclass(frozen=True, eq=False)
+class Evident:
+    """Losses of commands that are there, whatever else is.
+
+    Attributes:
+        unit: Whose commands.
+        law: How they come about.
+        point: The simulator in which they are likeliest.
+        without: Deviance of the best explanation without losses.
+        segments: Of each split, with the commands as they were sent, at the nominal fit.
+    """
+
+    unit: Unit
+    law: LossLaw
+    point: Point
+    without: float
+    segments: Mapping[str, LossSegments]
+
+    @property
+    def actuators(self) -> list[int]:
+        """Those whose commands are lost together."""
+        return _actuators(self.unit)
+
+
+class _Likely(NamedTuple):
+    """The likeliest losses of a unit in one simulator, and whether they are plain."""
+
+    cost: float
+    gained: float
+    unit: Unit
+    law: LossLaw
+    data: Mapping[str, LossSegments]
+    plain: bool
+
+
+def evident(sought: Sought, prepared: Prepared) -> Evident | None:
+    """Return the likeliest losses of commands, if segments are much likelier with any.
+
+    Or those that were found in the place of effects that last.
+
+    Args:
+        sought: What was found, and short segments.
+        prepared: Runs in which it is decided which commands arrived.
+    """
+    suspects, best = sought.suspects, sought.selection.best
+    known = {one.unit for one in sought.found if not one.beside}
+    units = [u for u in suspects.units if isinstance(u.effect, PacketDrop)]
+    bases = [(suspects.nominal, suspects.alone)]
+    bases += [(suspects.best, suspects.rival)] if best.units else []
+    every = [[_likely(data, unit, alone) for unit in units] for data, alone in bases]
+    plain = [one for part in every for one in part if one.plain or one.unit in known]
+    if not plain:
+        alike = (_fitted_again(sought, prepared, part) for part in every if part)
+        plain = [one for one in alike if one is not None][:1]
+    if not plain:
+        return None
+    seen = min(plain, key=lambda one: one.cost)
+    least = min(sum(alone.costs) for _, alone in bases)
+    return Evident(seen.unit, seen.law, seen.data[JUDGED[0]].point, least, suspects.nominal)
+
+
+def _likely(data: Mapping[str, LossSegments], unit: Unit, alone: Alone) -> _Likely:
+    judged = [data[name].tried(unit) for name in JUDGED]
+    law = likeliest(judged, SHARES, SCATTER.tolist(), SPOILED, size=alone.law.size)
+    cost = law.deviance(judged)
+    gained = sum(alone.costs) - cost
+    return _Likely(cost, gained, unit, law, data, gained > CLEAR and _plain(law, judged))
+
+
+def _plain(law: LossLaw, judged: Sequence[Tried]) -> bool:
+    """Return whether losses explain nearly all that is wrong with the segments that have them.
+
+    And whether most segments are right with them: another law than the true one is wrong
+    everywhere, and some of that looks like losses.
+    """
+    told = Told.joined([law.told(one) for one in judged])
+    concerned = told.lost > LIKELIER
+    if concerned.sum() < FEWEST or spoiled_share(told) > WRONG:
+        return False
+    return bool(told.before[concerned].mean() > _TIMES * told.after[concerned].mean())
+
+
+def _fitted_again(sought: Sought, prepared: Prepared, found: Sequence[_Likely]) -> _Likely | None:
+    """Return the likeliest losses, in a simulator fitted to the commands that arrived.
+
+    Nothing where they are not plain there, or where they are no likelier than before.
+
+    Args:
+        sought: What was found.
+        prepared: Runs in which it is decided which commands arrived.
+        found: Losses of every unit in one simulator.
+    """
+    best = min(found, key=lambda one: one.cost)
+    if best.gained < CLEAR:
+        return None
+    logs = prepared.logs
+    for _ in range(_ROUNDS):
+        point = best.data[JUDGED[0]].point
+        logs = Arrivals(prepared, point, _actuators(best.unit), best.law).decided(logs)
+        again = with_other_logs(prepared, logs, generator=sought.generator)
+        fit = refit(again.sets["train"], [point], iterations=_AGAIN)[0]
+        data = {name: one.at(fit.point) for name, one in best.data.items()}
+        better = _likely(data, best.unit, sought.suspects.alone)
+        if better.cost > best.cost - CERTAIN:
+            break
+        best = better
+    return best if best.plain else None
+
+
+def lost_beside(seen: Evident, model: Model) -> Chance | None:
+    """Return losses of commands beside the effects of a model, nothing if they may be those.
+
+    Args:
+        seen: The losses that are evident, in segments with the commands that were sent.
+        model: The effects.
+    """
+    if not apart(seen.unit, model.units):
+        return None
+    data = {name: one.at(model.fit.point) for name, one in seen.segments.items()}
+    return found_beside(data, seen.unit, Alone.of(data), model.units)
+
+
+def _actuators(unit: Unit) -> list[int]:
+    return [int(number) for number in np.flatnonzero(unit.direction)]
