@@ -9,13 +9,13 @@ from test_diagnose import logs, system
 
 from torchrl_bayessim.diagnosis import objective
 from torchrl_bayessim.diagnosis.diagnose import diagnose
-from torchrl_bayessim.diagnosis.little_left import little_left, one_alone
+from torchrl_bayessim.diagnosis.little_left import all_of_little, little_left, one_alone
 from torchrl_bayessim.diagnosis.screening import Screen
 from torchrl_bayessim.effects.joints import ViscousFriction
 
 SOME = (
     "dead_band", "quadratic_drag", "coulomb_friction", "action_lag", "action_gain",
-    "parallel_spring", "sensor_gain", "payload",
+    "parallel_spring", "sensor_gain", "payload", "action_delay", "series_elasticity",
 )  # fmt: skip
 
 
@@ -35,7 +35,7 @@ FREE = of_segments(touching=None)
         ([], 440.0, 1e-8, False),
         ([Unit("friction", "hip")], 440.0, 1e-8, False),
         ([Unit("backlash", "hip", group="elasticity")], 440.0, 1e-8, False),
-        ([Unit("delay", "x", group="timing")], 440.0, 1e-8, False),
+        ([Unit("delay", "x", group="timing")], 440.0, 1e-8, True),
         ([A, Unit("payload", "hip")], 440.0, 1e-8, False),
     ],
     ids=[
@@ -91,9 +91,41 @@ def test_a_drag_that_is_a_thousandth_of_the_gap_at_most_is_named_beside_a_dead_b
     assert set(weak(drag=0.0)) == {"dead_band"}
 
 
-def weak(drag):
-    """Return what is found of an arm with a dead band and some drag, by name."""
-    act = lambda u, k: np.sign(u[k]) * max(abs(u[k]) - 0.5, 0.0)
+def test_a_weak_drag_is_named_beside_a_delay_and_what_is_late_is_not():
+    """A lag beside a delay, or the other way round, is the form of one of them."""
+    behind = lambda u, k: u[max(k - 2, 0)]
+    found = weak(drag=0.002, act=behind)
+    assert len(found) == 2
+    assert found["quadratic_drag"].strength == pytest.approx(0.002, rel=0.3)
+    assert len(weak(drag=0.0, act=behind)) == 1
+
+
+@pytest.mark.parametrize(
+    ("known", "added", "asked"),
+    [
+        ("timing", "timing", 0),
+        ("timing", "elasticity", 0),
+        ("timing", "drag", 1),
+        ("gain", "timing", 1),
+    ],
+)
+def test_what_is_late_is_not_asked_beside_what_is_late(monkeypatch, known, added, asked):
+    base, more = Unit("first", "x", group=known), Unit("second", "x", group=added)
+    seen = []
+    chosen = lambda _, models: seen.extend(models)
+    monkeypatch.setattr("torchrl_bayessim.diagnosis.little_left.chosen", chosen)
+    models = [plain([base, more], 400.0)]
+    start, best = plain([], 900.0), plain([base], 440.0)
+    assert all_of_little(start, best, models, train=FREE, left=[], missing=lambda *_: False) is None
+    assert len(seen) == asked
+
+
+def dead_band(u, k):
+    return np.sign(u[k]) * max(abs(u[k]) - 0.5, 0.0)
+
+
+def weak(drag, act=dead_band):
+    """Return what is found of an arm with a strong cause and some drag, by name."""
     push = lambda q, v: -drag * v * abs(v)
     report = diagnose(system(), None, logs(10, 300, act=act, push=push), effects=SOME)
     return {effect.name: effect for effect in report.effects}

@@ -30,7 +30,8 @@ _SURELY = 1e-4  # p-value of what is left, to look for one effect that is all of
 _PLAIN = 25.0  # deviance that it removes, which chance hardly makes of any of a hundred units
 _DRAWS, _RARELY = 1000, 0.99  # of noise, and where the largest ratio of so many of them lies
 _MORE = 2.0  # times that: what a fit may explain and a screen does not
-_FORMS = CoulombFriction.group, Backlash.group, ActionDelay.group
+_FORMS = CoulombFriction.group, Backlash.group
+_LATE = ActionDelay.group, Backlash.group  # of each other, and of what a drive that gives way does
 _SMOOTH = ViscousFriction, QuadraticDrag, ParallelSpring
 
 
@@ -38,8 +39,7 @@ def little_left(best: Model, p_value: float, train: Objective) -> bool:
     """Return whether a model of one effect leaves little more than noise, but surely more.
 
     Of one, since a third effect mends the forms of two others more easily. Not beside dry
-    friction, a drive that gives way or contacts, which no time step follows exactly, nor beside
-    what is late, by a delay or by filters, which are forms of each other.
+    friction, a drive that gives way or contacts, which no time step follows exactly.
 
     Args:
         best: With the effects that were found.
@@ -80,6 +80,9 @@ def all_of_little(
 ) -> Model | None:
     """Return the model with the one effect that is all of the little that is left, if one is.
 
+    Not of what is late beside what is late: delays, filters and springs in a drive are forms of
+    each other.
+
     Args:
         start: Parameters alone.
         best: With the effects that were found.
@@ -88,7 +91,14 @@ def all_of_little(
         left: Units that a model may lack.
         missing: Told a screen of a model, and the model: whether something surely is missing.
     """
-    single = [model for model in models if len(model.units) == len(best.units) + 1]
+    late = any(unit.effect.group in _LATE for unit in best.units)
+    barred = _LATE if late else ()
+    single = [
+        model
+        for model in models
+        if len(model.units) == len(best.units) + 1
+        and not any(unit.effect.group in barred for unit in model.beyond(best))
+    ]
     better = chosen(best, single)
     if better is None:
         return None
