@@ -4,8 +4,8 @@ What rounding a command u to multiples of s takes from it, :math:`s \cdot \opera
 s) - u`, at a step :math:`s (1 + \delta)` has nothing in common with that at s once :math:`\delta
 |u| / s` is half: signatures at a few strengths miss all steps between them. The course of the
 missing force shows some (:mod:`.shapes`), but not where contacts or noise hide a single row's
-command. So where nothing else explains the data, steps are simulated as far apart as the largest
-command allows, from the finest that so many can tell apart.
+command. So where nothing explains half of what is missing, steps are simulated as far apart as the
+largest command allows, from the finest that so many can tell apart.
 """
 
 from __future__ import annotations

@@ -33,6 +33,7 @@ from .wavering import waver
 
 Array = NDArray[np.float64]
 _MOST = 4  # effects in one explanation
+_LITTLE = 0.5  # of what is left
 _UNSEEN = 1.0  # a deviance, in units of the dispersion, that no test can detect
 
 
@@ -125,6 +126,7 @@ class Search:
             else partial(self._all, best, left=left),
         )
         unknown = better is None or ActionQuantization.name in better.names
+        unknown = unknown or _explains_little(best, better)
         return self._or_rounded(best, better) if unknown and not best.units else better
 
     def _or_rounded(self, best: Model, better: Model | None) -> Model | None:
@@ -202,6 +204,11 @@ def _worth(start: Model, train: Objective) -> Callable[..., bool]:
 def with_forms_of(units: Sequence[Unit], model: Model) -> list[Unit]:
     """Return the units, those of a model with fitted forms in the places of their like."""
     return with_shapes(units, [unit for unit in model.units if unit not in units])
+
+
+def _explains_little(base: Model, better: Model) -> bool:
+    """Return whether most of what a base leaves is left still."""
+    return base.mean_square - better.mean_square < _LITTLE * (base.mean_square - 1.0)
 
 
 def _beside(model: Model, found: Sequence[Unit]) -> list[Unit]:
