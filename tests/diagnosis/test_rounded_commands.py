@@ -11,7 +11,7 @@ from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.objective import Unit
 from torchrl_bayessim.diagnosis.rounded_commands import _told_apart, steps_between
 from torchrl_bayessim.diagnosis.screening import Screen
-from torchrl_bayessim.diagnosis.search import _explains_little
+from torchrl_bayessim.diagnosis.search import _may_be_rounded
 from torchrl_bayessim.effects.action import ActionQuantization
 from torchrl_bayessim.envs.task import Task, uniform_reset
 from torchrl_bayessim.inference.priors import BoxPrior
@@ -86,7 +86,8 @@ def test_rounded_commands_are_found_between_the_strengths_that_all_effects_are_t
 @pytest.mark.parametrize(("left", "little"), [(800.0, True), (500.0, False)])
 def test_a_step_is_looked_for_where_what_was_found_explains_less_than_half(left, little):
     """Of 400 numbers, of which a base leaves twice and a half the noise: 600 beyond it."""
-    assert _explains_little(plain([], 1000.0), plain([A], left)) == little
+    assert _may_be_rounded(plain([], 1000.0), plain([A], left)) == little
+    assert _may_be_rounded(plain([], 1000.0), None)
 
 
 def test_steps_are_as_close_as_the_largest_command_tells_them_apart():

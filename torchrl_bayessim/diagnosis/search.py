@@ -125,9 +125,9 @@ class Search:
             if apart
             else partial(self._all, best, left=left),
         )
-        unknown = better is None or ActionQuantization.name in better.names
-        unknown = unknown or _explains_little(best, better)
-        return self._or_rounded(best, better) if unknown and not best.units else better
+        if best.units or not _may_be_rounded(best, better):
+            return better
+        return self._or_rounded(best, better)
 
     def _or_rounded(self, best: Model, better: Model | None) -> Model | None:
         """Return the better model, or one with commands that are rounded to a step of their own."""
@@ -206,8 +206,10 @@ def with_forms_of(units: Sequence[Unit], model: Model) -> list[Unit]:
     return with_shapes(units, [unit for unit in model.units if unit not in units])
 
 
-def _explains_little(base: Model, better: Model) -> bool:
-    """Return whether most of what a base leaves is left still."""
+def _may_be_rounded(base: Model, better: Model | None) -> bool:
+    """Return whether commands may be rounded: they are, or most of what a base leaves is left."""
+    if better is None or ActionQuantization.name in better.names:
+        return True
     return base.mean_square - better.mean_square < _LITTLE * (base.mean_square - 1.0)
 
 
