@@ -46,7 +46,7 @@ class Beside:
     Attributes:
         sent: The runs that were looked at, with the commands that were sent, or as recorded.
         prepared: With those that arrived, or with others in the place of those that were lost.
-        selection: The effects that last.
+        selection: The effects that last; none where losses are all there is.
         chance: The losses.
     """
 

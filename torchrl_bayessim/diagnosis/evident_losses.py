@@ -14,21 +14,21 @@ __all__ = ["Evident", "evident", "lost_beside"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
 from ..effects.action import PacketDrop
-from .arrivals import Arrivals
+from .arrivals import Arrivals, fewer
 from .beside_losses import CERTAIN, Sought
 from .chance import Chance
 from .loss_law import LossLaw, Told, Tried, likeliest
 from .loss_segments import LossSegments
 from .loss_suspects import FEWEST, JUDGED, LIKELIER, SCATTER, SPOILED, Alone, spoiled_share
-from .losses import CLEAR, SHARES, WRONG, apart, found_beside
+from .losses import EVIDENT, SHARES, WRONG, found_beside, may_be_beside
 from .model import Model
 from .objective import Point, Unit
-from .preparation import Prepared
 from .prepared_anew import with_other_logs
 from .refit import refit
 
@@ -72,14 +72,14 @@ class _Likely(NamedTuple):
     plain: bool
 
 
-def evident(sought: Sought, prepared: Prepared) -> Evident | None:
+def evident(sought: Sought) -> Evident | None:
     """Return the likeliest losses of commands, if segments are much likelier with any.
 
-    Or those that were found in the place of effects that last.
+    Or those that were found in the place of effects that last. Where none are plain, those that are
+    in a simulator that is fitted again, first with parameters alone.
 
     Args:
         sought: What was found, and short segments.
-        prepared: Runs in which it is decided which commands arrived.
     """
     suspects, best = sought.suspects, sought.selection.best
     known = {one.unit for one in sought.found if not one.beside}
@@ -89,8 +89,9 @@ def evident(sought: Sought, prepared: Prepared) -> Evident | None:
     every = [[_likely(data, unit, alone) for unit in units] for data, alone in bases]
     plain = [one for part in every for one in part if one.plain or one.unit in known]
     if not plain:
-        alike = (_fitted_again(sought, prepared, part) for part in every if part)
-        plain = [one for one in alike if one is not None][:1]
+        sets = zip(every, bases, strict=True)
+        again = (_fitted_again(sought, part, alone) for part, (_, alone) in sets)
+        plain = list(islice(filter(None, again), 1))
     if not plain:
         return None
     seen = min(plain, key=lambda one: one.cost)
@@ -103,7 +104,7 @@ def _likely(data: Mapping[str, LossSegments], unit: Unit, alone: Alone) -> _Like
     law = likeliest(judged, SHARES, SCATTER.tolist(), SPOILED, size=alone.law.size)
     cost = law.deviance(judged)
     gained = sum(alone.costs) - cost
-    return _Likely(cost, gained, unit, law, data, gained > CLEAR and _plain(law, judged))
+    return _Likely(cost, gained, unit, law, data, gained > EVIDENT and _plain(law, judged))
 
 
 def _plain(law: LossLaw, judged: Sequence[Tried]) -> bool:
@@ -119,27 +120,30 @@ def _plain(law: LossLaw, judged: Sequence[Tried]) -> bool:
     return bool(told.before[concerned].mean() > _TIMES * told.after[concerned].mean())
 
 
-def _fitted_again(sought: Sought, prepared: Prepared, found: Sequence[_Likely]) -> _Likely | None:
+def _fitted_again(sought: Sought, found: Sequence[_Likely], alone: Alone) -> _Likely | None:
     """Return the likeliest losses, in a simulator fitted to the commands that arrived.
 
     Nothing where they are not plain there, or where they are no likelier than before.
 
     Args:
         sought: What was found.
-        prepared: Runs in which it is decided which commands arrived.
         found: Losses of every unit in one simulator.
+        alone: That simulator without losses.
     """
-    best = min(found, key=lambda one: one.cost)
-    if best.gained < CLEAR:
+    best = min(found, key=lambda one: one.cost, default=None)
+    if best is None or best.gained < EVIDENT:
         return None
+    prepared = fewer(sought.prepared, len(_actuators(best.unit)))
     logs = prepared.logs
     for _ in range(_ROUNDS):
         point = best.data[JUDGED[0]].point
         logs = Arrivals(prepared, point, _actuators(best.unit), best.law).decided(logs)
         again = with_other_logs(prepared, logs, generator=sought.generator)
-        fit = refit(again.sets["train"], [point], iterations=_AGAIN)[0]
+        fit = again.nominal
+        if point.strengths:
+            fit = refit(again.sets["train"], [point], iterations=_AGAIN)[0]
         data = {name: one.at(fit.point) for name, one in best.data.items()}
-        better = _likely(data, best.unit, sought.suspects.alone)
+        better = _likely(data, best.unit, alone)
         if better.cost > best.cost - CERTAIN:
             break
         best = better
@@ -153,7 +157,7 @@ def lost_beside(seen: Evident, model: Model) -> Chance | None:
         seen: The losses that are evident, in segments with the commands that were sent.
         model: The effects.
     """
-    if not apart(seen.unit, model.units):
+    if not may_be_beside(seen.unit, model.units):
         return None
     data = {name: one.at(model.fit.point) for name, one in seen.segments.items()}
     return found_beside(data, seen.unit, Alone.of(data), model.units)

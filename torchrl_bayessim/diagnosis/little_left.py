@@ -91,14 +91,9 @@ def all_of_little(
         left: Units that a model may lack.
         missing: Told a screen of a model, and the model: whether something surely is missing.
     """
-    late = any(unit.effect.group in _LATE for unit in best.units)
-    barred = _LATE if late else ()
-    single = [
-        model
-        for model in models
-        if len(model.units) == len(best.units) + 1
-        and not any(unit.effect.group in barred for unit in model.beyond(best))
-    ]
+    single = [model for model in models if len(model.units) == len(best.units) + 1]
+    if any(_late(unit) for unit in best.units):
+        single = [model for model in single if not any(map(_late, model.beyond(best)))]
     better = chosen(best, single)
     if better is None:
         return None
@@ -109,3 +104,7 @@ def all_of_little(
     if not no_rival(best, better, single) or waver(best, better, train.segments):
         return None
     return None if missing(compare(train, better.fit, others).seen, better) else better
+
+
+def _late(unit: Unit) -> bool:
+    return unit.effect.group in _LATE and not isinstance(unit.effect, _SMOOTH)

@@ -10,7 +10,7 @@ place of the effects that the search found, and beside them.
 
 from __future__ import annotations
 
-__all__ = ["CLEAR", "SHARES", "WRONG", "apart", "found_beside", "losses"]
+__all__ = ["EVIDENT", "SHARES", "WRONG", "found_beside", "losses", "may_be_beside"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -52,7 +52,7 @@ _FEW = 0.1  # of the deviance that such losses explain: what they may cost in ru
 _BIASED = 0.1  # of the excess of the segments concerned, which parameters leave in all
 _OTHERS = 1 / 6  # of the segments that something else may have spoiled
 _REMAIN = 0.6  # or of those that were spoiled without losses
-CLEAR, WRONG = 100.0, 0.3  # deviance of what is clear, and segments that losses do not explain
+EVIDENT, WRONG = 100.0, 0.3  # deviance, to be evident, and segments that losses do not explain
 _LATE = ActionDelay.group
 _INTERVAL = 3.92  # standard deviations that are 95 %
 _WIDER = 1.5  # times: errors were, on robots whose share was known
@@ -74,7 +74,7 @@ def losses(prepared: Prepared, selection: Selection, suspects: Suspects) -> list
     alone = suspects.alone
     # what the best explanation without chance gains by the same standard
     found, least = _all_found(nominal, some, alone), sum(alone.costs) - sum(rival.costs)
-    able = [unit for unit in some if apart(unit, selection.best.units)]
+    able = [unit for unit in some if may_be_beside(unit, selection.best.units)]
     if selection.best.units and able:
         others = _all_found(best, able, rival, selection.best.units)
         beside = [replace(one, beside=True) for one in others]
@@ -93,7 +93,7 @@ def _telling(prepared: Prepared, units: Sequence[Unit]) -> list[Unit]:
     return [u for u in units if isinstance(u.effect, PacketDrop) or not rests[u.direction.index(1)]]
 
 
-def apart(unit: Unit, others: Sequence[Unit]) -> bool:
+def may_be_beside(unit: Unit, others: Sequence[Unit]) -> bool:
     """Return whether losses beside effects could not be another form of those.
 
     A lag that is not quite the true one errs as commands would that were lost, and contacts that
@@ -181,7 +181,7 @@ def _explain(
     before, after = (
         float((e[concerned] - law.scatter).mean()) for e in (known.before, known.after)
     )
-    clear = sum(gains) > CLEAR and after < _CLEARLY * before
+    clear = sum(gains) > EVIDENT and after < _CLEARLY * before
     if _sensed(others) and not clear:
         return False
     surely = bool(others) and clear

@@ -3,7 +3,8 @@
 What losses spoil is more than what many an effect does, and an effect that is missing spoils the
 segments in which no command was lost. Where losses are evident, whatever else there is, the search
 is done again on the commands that arrived (`arrivals`), which commands these are is decided on
-again in the simulator that it found, and so on. In the end losses have to explain the segments that
+again in the simulator that it found, and so on, until nothing but losses is needed or nothing is
+gained. In the end losses have to explain the segments that
 have them in that simulator, by the standard that is theirs elsewhere (`losses`).
 """
 
@@ -16,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .arrivals import Arrivals
+from .arrivals import Arrivals, fewer
 from .beside_losses import CERTAIN, Beside, Sought
 from .chance import Chance
 from .elimination import parts
@@ -28,19 +29,18 @@ from .selection import Selection
 
 _ROUNDS = 3  # of deciding which commands arrived and searching on
 _HALF = 0.5  # of what parameters leave of the commands that arrived
-_LARGEST = 1_000_000  # control steps simulated to decide on all commands
-_SOME = "which commands arrived was decided on in {} of {} runs: all would have taken long"
-_SIMULATED = 18  # for each row and actuator
 
 
 def beside_lost_commands(sought: Sought) -> Beside | None:
-    """Return effects that last and losses that explain more together than what was found."""
+    """Return effects that last and losses that explain more together than what was found.
+
+    Or losses alone, where none were found with the commands as they were sent.
+    """
     prepared, selection, found = sought.prepared, sought.selection, sought.found
-    some = _fewer(prepared, prepared.predictor.system.task.model.nu)
-    seen = evident(sought, some)
+    seen = evident(sought)
     if seen is None:
         return None
-    some = _fewer(prepared, len(seen.actuators))
+    some = fewer(prepared, len(seen.actuators))
     best = _searched(some, selection, seen, search=sought.search, generator=sought.generator)
     if best is None:
         return None
@@ -80,21 +80,6 @@ def _matters(selection: Selection) -> bool:
     return before > WHITE and before - after > _HALF * (before - 1.0)
 
 
-def _fewer(prepared: Prepared, actuators: int) -> Prepared:
-    """Return what was prepared, with some of the runs where to decide on all would take long."""
-    every = prepared.logs
-    rows = sum(len(log) for part in every.values() for log in part)
-    share = _LARGEST / (_SIMULATED * rows * actuators)
-    if share >= 1.0:
-        return prepared
-    some = {}
-    for name, part in every.items():
-        count = min(max(2, int(share * len(part))), len(part))
-        some[name] = [part[i] for i in np.linspace(0, len(part) - 1, count).round().astype(int)]
-    kept, total = (sum(map(len, parts.values())) for parts in (some, every))
-    return replace(prepared, logs=some).alarmed(_SOME.format(kept, total))
-
-
 def _searched(
     prepared: Prepared,
     sent: Selection,
@@ -114,7 +99,7 @@ def _searched(
             break
         least, point = selection.best.mean_square, selection.best.fit.point
         if not selection.best.units:
-            return result or (again, selection)
+            return again, selection  # losses are all there is
         if _matters(selection):  # or decisions in this simulator may be better ones
             result = again, selection
         if least < WHITE:

@@ -33,7 +33,7 @@ from .refit import Fit, refit
 Array = NDArray[np.float64]
 LIKELY = 6.0  # a deviance that chance often makes
 _CHANCE = 0.01  # of a test that two models explain the data equally well
-_NEXT_TO_NOTHING = 0.03  # of what all runs of the fit gain
+_NEXT_TO_NOTHING, _OF_ITS_OWN = 0.03, 0.05  # of what all runs of the fit gain; of one's deviance
 _WORSE = 1.5  # times the misfit of the best model: too much for an equal, however few the data
 _CERTAIN, _SEVERAL = 5.0, 2  # times what judging runs must gain; runs of the fit that gain it
 WHITE = 1.2  # mean squared innovation of a model that leaves noise alone
@@ -152,9 +152,10 @@ def shown(base: Model, model: Model) -> bool:
     count = len(model.fit.innovations)
     logs = model.logs[:count]
     better = (base.deviances() - model.deviances())[:count] / model.dispersion()
-    each = np.bincount(logs, better)
+    each, had = np.bincount(logs, better), np.bincount(logs, base.deviances()[:count])
     runs = int((each > _CERTAIN * needed(base, model)).sum())
-    return runs >= _SEVERAL and not (each < -max(LIKELY, _NEXT_TO_NOTHING * each.sum())).any()
+    nothing = np.minimum(_NEXT_TO_NOTHING * each.sum(), _OF_ITS_OWN * had / model.dispersion())
+    return runs >= _SEVERAL and not (each < -np.maximum(nothing, LIKELY)).any()
 
 
 def as_good(best: Model, rival: Model) -> bool:

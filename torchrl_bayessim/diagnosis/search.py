@@ -33,7 +33,7 @@ from .wavering import waver
 
 Array = NDArray[np.float64]
 _MOST = 4  # effects in one explanation
-_LITTLE = 0.5  # of what is left
+_HALF = 0.5  # of what is left
 _UNSEEN = 1.0  # a deviance, in units of the dispersion, that no test can detect
 
 
@@ -207,10 +207,10 @@ def with_forms_of(units: Sequence[Unit], model: Model) -> list[Unit]:
 
 
 def _may_be_rounded(base: Model, better: Model | None) -> bool:
-    """Return whether commands may be rounded: they are, or most of what a base leaves is left."""
+    """Return whether commands may be rounded: they are, or half of what a base leaves is left."""
     if better is None or ActionQuantization.name in better.names:
         return True
-    return base.mean_square - better.mean_square < _LITTLE * (base.mean_square - 1.0)
+    return base.mean_square - better.mean_square < _HALF * (base.mean_square - 1.0)
 
 
 def _beside(model: Model, found: Sequence[Unit]) -> list[Unit]:
