@@ -10,7 +10,9 @@ from test_diagnose import logs, system
 from torchrl_bayessim.diagnosis import objective
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.little_left import all_of_little, little_left, one_alone
+from torchrl_bayessim.diagnosis.objective import units_of
 from torchrl_bayessim.diagnosis.screening import Screen
+from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.effects.joints import ViscousFriction
 
 SOME = (
@@ -91,41 +93,44 @@ def test_a_drag_that_is_a_thousandth_of_the_gap_at_most_is_named_beside_a_dead_b
     assert set(weak(drag=0.0)) == {"dead_band"}
 
 
-def test_a_weak_drag_is_named_beside_a_delay_and_what_is_late_is_not():
-    """A lag beside a delay, or the other way round, is the form of one of them."""
-    behind = lambda u, k: u[max(k - 2, 0)]
-    found = weak(drag=0.002, act=behind)
-    assert len(found) == 2
-    assert found["quadratic_drag"].strength == pytest.approx(0.002, rel=0.3)
-    assert len(weak(drag=0.0, act=behind)) == 1
+@pytest.mark.parametrize("cause", ["quadratic_drag", "parallel_spring"])
+def test_a_weak_cause_is_named_beside_a_delay(cause):
+    name = "drag" if cause == "quadratic_drag" else "spring"
+    found = weak(**{name: 0.002}, act=lambda u, k: u[max(k - 2, 0)])
+    late = {"action_delay", "action_lag"} & set(found)
+    assert set(found) - late == {cause}
+    assert len(late) == 1
+    assert found[cause].strength == pytest.approx(0.002, rel=0.3)
 
 
 @pytest.mark.parametrize(
     ("known", "added", "asked"),
     [
-        ("timing", "timing", 0),
-        ("timing", "elasticity", 0),
-        ("timing", "drag", 1),
-        ("gain", "timing", 1),
+        ("action_delay", "sensor_lag", False),
+        ("action_delay", "series_elasticity", False),
+        ("action_delay", "parallel_spring", True),  # a spring, but not of a drive
+        ("parallel_spring", "action_delay", True),
+        ("action_gain", "action_delay", True),
     ],
 )
 def test_what_is_late_is_not_asked_beside_what_is_late(monkeypatch, known, added, asked):
-    base, more = Unit("first", "x", group=known), Unit("second", "x", group=added)
+    """A lag beside a delay, or the other way round, is the form of one of them."""
+    base, more = (units_of([effect(name)], system().robot)[0] for name in (known, added))
     seen = []
     chosen = lambda _, models: seen.extend(models)
     monkeypatch.setattr("torchrl_bayessim.diagnosis.little_left.chosen", chosen)
     models = [plain([base, more], 400.0)]
     start, best = plain([], 900.0), plain([base], 440.0)
     assert all_of_little(start, best, models, train=FREE, left=[], missing=lambda *_: False) is None
-    assert len(seen) == asked
+    assert seen == models * asked
 
 
 def dead_band(u, k):
     return np.sign(u[k]) * max(abs(u[k]) - 0.5, 0.0)
 
 
-def weak(drag, act=dead_band):
-    """Return what is found of an arm with a strong cause and some drag, by name."""
-    push = lambda q, v: -drag * v * abs(v)
+def weak(drag=0.0, spring=0.0, act=dead_band):
+    """Return what is found of an arm with a strong cause and some drag or a spring, by name."""
+    push = lambda q, v: -drag * v * abs(v) - spring * q
     report = diagnose(system(), None, logs(10, 300, act=act, push=push), effects=SOME)
     return {effect.name: effect for effect in report.effects}

@@ -14,6 +14,7 @@ from test_lost_values import TWO, run_of_two
 
 from torchrl_bayessim.diagnosis.arrivals import Arrivals
 from torchrl_bayessim.diagnosis.beside_losses import Sought
+from torchrl_bayessim.diagnosis.chance import Chance
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.evident_losses import _likely, evident
 from torchrl_bayessim.diagnosis.loss_law import LossLaw
@@ -23,6 +24,8 @@ from torchrl_bayessim.diagnosis.losses import _sensed, may_be_beside
 from torchrl_bayessim.diagnosis.lost_commands import _matters, _searched, beside_lost_commands
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.preparation import prepare
+from torchrl_bayessim.diagnosis.prepared_anew import with_other_logs
+from torchrl_bayessim.diagnosis.scatter import Sent, _along
 from torchrl_bayessim.effects.action import PacketDrop
 from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.envs.task import Task
@@ -254,3 +257,47 @@ def test_losses_are_not_told_beside_what_errs_as_they_do(name, apart, sensed):
     assert may_be_beside(commands, units) == apart
     assert may_be_beside(samples, units)  # but clearly, beside what errs as they do
     assert _sensed(units) == sensed  # where they have to be clear
+
+
+@pytest.mark.parametrize(
+    ("found", "lasting", "beside"),
+    [([], [A], True), ([], [], False), (["losses"], [A], True), (["losses"], [], None)],
+)
+def test_losses_alone_are_told_where_none_were_found_without_the_commands_that_arrived(
+    monkeypatch, found, lasting, beside
+):
+    where = "torchrl_bayessim.diagnosis.lost_commands."
+    (unit,) = units_of([PacketDrop()], system().robot)
+    chance = Chance(unit, 0.2, 0.01, gain=900.0, left=np.ones(3), deviance=100.0)
+    seen = SimpleNamespace(actuators=[0], without=1000.0)
+    selection = SimpleNamespace(best=plain(lasting, 400.0))
+    monkeypatch.setattr(where + "fewer", lambda prepared, _: prepared)
+    monkeypatch.setattr(where + "evident", lambda _: seen)
+    monkeypatch.setattr(where + "_searched", lambda *_, **__: ("arrived", selection))
+    monkeypatch.setattr(where + "_needed", lambda *_: (selection, chance))
+    alone = [SimpleNamespace(deviance=800.0) for _ in found]
+    result = beside_lost_commands(Sought("sent", None, alone, None, None, None))
+    assert (None if result is None else result.chance.beside) is beside
+    if result is not None:
+        assert (result.sent, result.prepared) == ("sent", "arrived")
+
+
+def test_the_gap_of_the_commands_that_were_sent_is_with_parameters_that_were_fitted_to_these():
+    act, _ = jumps(0.3, 3)
+    units = units_of([PacketDrop()], system().robot)
+    generator = np.random.default_rng(0)
+    sent = prepare(system(), logs(6, act=act), units, generator=generator)
+    law = LossLaw(share=0.3, scatter=1.0, spoiled=0.01, size=16)
+    known = Arrivals(sent, sent.nominal.point, [0], law).decided(sent.logs)
+    again = with_other_logs(sent, known, generator=generator)
+    selection = SimpleNamespace(
+        nominal=SimpleNamespace(fit=again.nominal), best=SimpleNamespace(fit=again.nominal)
+    )
+    told = Sent.along(again, sent, selection)
+    assert told.lost > 200
+    test = again.sets["test"]
+    history, most = test.segments.history, len(test.segments)
+    pieces = again.mode.cut(sent.logs["test"], again.horizon, history=history, most=most)
+    points = [sent.nominal.point, again.nominal.point]
+    assert [told.refit, told.effects] == pytest.approx(_along(test, pieces, points).tolist())
+    assert told.refit != pytest.approx(told.effects, rel=0.05)

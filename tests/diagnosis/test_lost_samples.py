@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from test_diagnose import logs, system
+from test_diagnose import ARM, logs, system
 from test_lost_values import TWO, run_of_two, shown_again
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
@@ -124,3 +124,13 @@ def test_no_sample_is_replaced_where_losses_are_all_there_is():
     report = diagnose(robot, None, data, effects=some)
     assert [effect.name for effect in report.effects] == ["sensor_dropout"]
     assert not any("interpolated" in alarm for alarm in report.alarms)
+
+
+def test_samples_of_a_robot_that_nothing_drives_may_be_lost():
+    """No commands can be; and none are decided on."""
+    robot = system(ARM[: ARM.index("<actuator>")] + "</mujoco>")
+    rng = np.random.default_rng(4)
+    data = [shown_again(log, 0.1, rng) for log in logs(6, act=lambda u, k: 0.0)]
+    data = [replace(log, ctrl=torch.zeros(len(log), 0, dtype=torch.float64)) for log in data]
+    report = diagnose(robot, None, data, effects=("sensor_dropout", "coulomb_friction"))
+    assert [effect.name for effect in report.effects] == ["sensor_dropout"]

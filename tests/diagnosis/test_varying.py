@@ -78,6 +78,19 @@ def test_what_runs_of_the_fit_show_plainly_need_not_be_in_those_that_judge(train
 
 
 @pytest.mark.parametrize(
+    ("train", "better"),
+    [
+        ([1, 1, 1020, 900], True),  # by next to nothing, though it is more than chance
+        ([1, 1, 1100, 900], False),  # by a tenth of its own, however much the others gain
+        ([900, 900, 1020, 980], False),  # by much of what the others gain
+    ],
+)
+def test_a_run_may_be_next_to_nothing_worse_for_what_others_show_plainly(train, better):
+    base = of_runs([1000, 1000, 1000, 1000], 3.0, (A,))
+    assert shown(base, of_runs(train, 2.0, (A, C))) is better
+
+
+@pytest.mark.parametrize(
     ("left", "after", "instead"),
     [(2.3, 1.2, True), (2.1, 1.9, False), (4.8, 4.5, False), (1.3, 1.1, True)],
 )
