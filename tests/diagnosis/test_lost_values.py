@@ -11,13 +11,16 @@ import torch
 from test_chance import lost
 from test_diagnose import logs, system
 
+from torchrl_bayessim.diagnosis.chance import Chance
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.found import _matters as found_matters
 from torchrl_bayessim.diagnosis.loss_law import LossLaw, Tried, likeliest
 from torchrl_bayessim.diagnosis.loss_suspects import Alone, _explained
-from torchrl_bayessim.diagnosis.losses import found_beside
+from torchrl_bayessim.diagnosis.losses import _of_one_drive, found_beside
 from torchrl_bayessim.diagnosis.model import Model
+from torchrl_bayessim.diagnosis.objective import units_of
 from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
+from torchrl_bayessim.effects.action import PacketDrop
 from torchrl_bayessim.effects.joints import CoulombFriction
 from torchrl_bayessim.effects.sensors import SensorDropout, SensorGain
 from torchrl_bayessim.envs.task import Task
@@ -327,3 +330,24 @@ def test_chance_beside_effects_has_to_matter(gain, before, after, matters):
 
     scatter = SimpleNamespace(found=[SimpleNamespace(gain=gain)])
     assert found_matters(scatter, left(before), left(after)) == matters
+
+
+@pytest.mark.parametrize(
+    ("gains", "kept"),
+    [
+        ({"one": 200.0, "two": 60.0, "all": 90.0}, 3),
+        ({"one": 200.0, "two": 150.0, "all": 90.0}, 0),  # either, as it seems
+        ({"one": 200.0, "two": 150.0, "all": 400.0}, 3),  # both at once
+        ({"one": 200.0}, 1),
+        ({}, 0),
+    ],
+)
+def test_beside_effects_commands_of_one_drive_are_lost_or_those_of_all(gains, kept):
+    """And samples are another matter."""
+    robot = System(task=Task(model=mujoco.MjModel.from_xml_string(TWO), frame_skip=1)).robot
+    units = {unit.where: unit for unit in units_of([PacketDrop()], robot)}
+    samples = Chance(units_of([SensorDropout()], robot)[0], 0.1, 0.01, 150.0, np.ones(3))
+    found = [Chance(units[name], 0.1, 0.01, gain, np.ones(3)) for name, gain in gains.items()]
+    left = _of_one_drive([*found, samples])
+    assert samples in left
+    assert len(left) == kept + 1

@@ -46,8 +46,8 @@ SHARES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.25, 0.4, 0.6)  # s
 # deviances: to be found (contacts that come late look like a few losses), and that chance makes
 _NEEDED, _LIKELY = 40.0, 6.0
 _EXPLAINED = 0.5  # of the excess of the segments concerned, by what is left of them
-_STANDS_OUT = 1.0  # excess of segments with lost commands, to be found beside an effect
 _CLEARLY = 0.1  # of it may be left of what is found clearly
+_ELSEWHERE = 0.5  # of what lost commands of a drive explain, by those of another
 _FEW = 0.1  # of the deviance that such losses explain: what they may cost in runs without any
 _BIASED = 0.1  # of the excess of the segments concerned, which parameters leave in all
 _OTHERS = 1 / 6  # of the segments that something else may have spoiled
@@ -76,7 +76,7 @@ def losses(prepared: Prepared, selection: Selection, suspects: Suspects) -> list
     found, least = _all_found(nominal, some, alone), sum(alone.costs) - sum(rival.costs)
     able = [unit for unit in some if may_be_beside(unit, selection.best.units)]
     if selection.best.units and able:
-        others = _all_found(best, able, rival, selection.best.units)
+        others = _of_one_drive(_all_found(best, able, rival, selection.best.units))
         beside = [replace(one, beside=True) for one in others]
         if _most(beside) > _most(found) - least + _NEEDED:
             found, least = beside, 0.0
@@ -125,6 +125,25 @@ def _all_found(
     return [one for one in found if one is not None]
 
 
+def _of_one_drive(found: Sequence[Chance]) -> list[Chance]:
+    """Return losses without those of commands that several drives explain, each alone.
+
+    What is a little wrong everywhere looks as if commands of any of them were lost now and then.
+    """
+    commands = [one for one in found if isinstance(one.unit.effect, PacketDrop)]
+    first = max(commands, key=lambda one: one.gain, default=None)
+    if first is None or _drives(first) > 1:
+        return list(found)
+    others = [one.gain for one in commands if one is not first and _drives(one) == 1]
+    if max(others, default=0.0) < _ELSEWHERE * first.gain:
+        return list(found)
+    return [one for one in found if one not in commands]
+
+
+def _drives(one: Chance) -> int:
+    return int(np.count_nonzero(one.unit.direction))
+
+
 def _most(found: Sequence[Chance]) -> float:
     return max((one.gain for one in found), default=0.0)
 
@@ -135,8 +154,8 @@ def found_beside(
     """Return the losses of a unit beside others, nothing if they do not explain what they spoil.
 
     Commands beside an effect have to leave nothing of what they spoil, to be no more than is
-    plausible, and to stand out or to be clearly lost: a force law that is not quite the true one
-    errs everywhere a little, as if ever so many of them were.
+    plausible, and to be evident: a force law that is not quite the true one errs everywhere a
+    little, as if ever so many of them were.
     """
     tried, base = {name: one.tried(unit) for name, one in data.items()}, alone.law
     judged = [tried[name] for name in JUDGED]
@@ -195,6 +214,5 @@ def _explain(
         return False  # something else is wrong everywhere, and may look like this
     if after > _EXPLAINED * before:
         return False
-    faint = law.share > unit.high or after >= _CLEARLY * before
-    faint |= before < _STANDS_OUT and not clear
-    return not (others and isinstance(unit.effect, PacketDrop) and faint)
+    plausible = clear and law.share <= unit.high
+    return plausible or not (others and isinstance(unit.effect, PacketDrop))
