@@ -21,6 +21,10 @@ class Unit(NamedTuple):
     channel: str = "body"
 
     @property
+    def targets(self):
+        return [i for i, part in enumerate(self.direction) if part]
+
+    @property
     def effect(self):
         joint = ["hip", "knee", "x", "y"].index(self.where)
         return SimpleNamespace(

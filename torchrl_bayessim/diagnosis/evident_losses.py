@@ -17,8 +17,6 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import NamedTuple
 
-import numpy as np
-
 from ..effects.action import PacketDrop
 from .arrivals import Arrivals, fewer
 from .beside_losses import CERTAIN, Sought
@@ -58,7 +56,7 @@ class Evident:
     @property
     def actuators(self) -> list[int]:
         """Those whose commands are lost together."""
-        return _actuators(self.unit)
+        return self.unit.targets
 
 
 class _Likely(NamedTuple):
@@ -133,11 +131,11 @@ def _fitted_again(sought: Sought, found: Sequence[_Likely], alone: Alone) -> _Li
     best = min(found, key=lambda one: one.cost, default=None)
     if best is None or best.gained < EVIDENT:
         return None
-    prepared = fewer(sought.prepared, len(_actuators(best.unit)))
+    prepared = fewer(sought.prepared, len(best.unit.targets))
     logs = prepared.logs
     for _ in range(_ROUNDS):
         point = best.data[JUDGED[0]].point
-        logs = Arrivals(prepared, point, _actuators(best.unit), best.law).decided(logs)
+        logs = Arrivals(prepared, point, best.unit.targets, best.law).decided(logs)
         again = with_other_logs(prepared, logs, generator=sought.generator)
         fit = again.nominal
         if point.strengths:
@@ -161,7 +159,3 @@ def lost_beside(seen: Evident, model: Model) -> Chance | None:
         return None
     data = {name: one.at(model.fit.point) for name, one in seen.segments.items()}
     return found_beside(data, seen.unit, Alone.of(data), model.units)
-
-
-def _actuators(unit: Unit) -> list[int]:
-    return [int(number) for number in np.flatnonzero(unit.direction)]

@@ -168,8 +168,7 @@ def _places_of(model: Model, robot: Robot) -> set[tuple[str, int]]:
 def _places(unit: Unit, robot: Robot) -> set[tuple[str, int]]:
     """Return the joints at which a unit acts, -1 where it is none, and whether on sensors."""
     side = "sensing" if unit.effect.channel == "sensing" else "forces"
-    on = (target for target, part in enumerate(unit.direction) if part)
-    return {(side, unit.effect.joint(robot, target)) for target in on}
+    return {(side, unit.effect.joint(robot, target)) for target in unit.targets}
 
 
 def _does_something(unit: Unit, model: Model) -> bool:

@@ -60,8 +60,7 @@ def location(
             perhaps += [rivals.get(name, unit.effect.channel) for name in confused]
         for channel in perhaps:
             channels[channel] += gain / len(perhaps)
-        moved = [j for i, part in enumerate(unit.direction) if part
-                 and (j := unit.effect.joint(robot, i)) >= 0]  # fmt: skip
+        moved = [j for i in unit.targets if (j := unit.effect.joint(robot, i)) >= 0]
         for joint in moved:
             joints[robot.joints[joint]] += gain / len(moved)
     if not any(joints.values()):  # of what acts at no joint, where it shows

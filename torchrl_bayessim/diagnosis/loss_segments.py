@@ -62,11 +62,11 @@ class LossSegments:
 
     def tried(self, unit: Unit) -> Tried:
         """Return the segments under every pattern of losses."""
-        targets, steps = np.flatnonzero(unit.direction), self.objective.segments.horizon
+        targets, steps = unit.targets, self.objective.segments.horizon
         commands = isinstance(unit.effect, PacketDrop)
         patterns = _patterns(steps if commands else 1 + steps)
         of = self._of_commands if commands else self._of_samples
-        parts = [of(int(target), patterns) for target in targets]  # lost together
+        parts = [of(target, patterns) for target in targets]  # lost together
         columns, changes = (np.concatenate(part, -1) for part in zip(*parts, strict=True))
         squares = _squares(self.left, columns, changes)
         return Tried(squares, np.array([sum(p) for p in patterns]), len(patterns[0]))

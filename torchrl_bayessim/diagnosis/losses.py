@@ -141,7 +141,7 @@ def _of_one_drive(found: Sequence[Chance]) -> list[Chance]:
 
 
 def _drives(one: Chance) -> int:
-    return int(np.count_nonzero(one.unit.direction))
+    return len(one.unit.targets)
 
 
 def _most(found: Sequence[Chance]) -> float:

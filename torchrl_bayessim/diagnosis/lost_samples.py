@@ -94,7 +94,7 @@ class _Renewal:
         law = LossLaw(self.share, 1.0, _SPOILED, self.size)
         likely = LossSegments.of(objective, point).lost(self.unit, law)
         lost = _decided(len(log), pieces.start, likely)
-        column = int(np.flatnonzero(self.unit.direction)[0])
+        column = self.unit.targets[0]
         return _interpolated(log, lost, int(predictor.sensing.channels[column]))
 
 

@@ -73,6 +73,11 @@ class Unit:
         """The effect's name."""
         return self.effect.name
 
+    @property
+    def targets(self) -> list[int]:
+        """The numbers of the targets at which it acts."""
+        return [target for target, part in enumerate(self.direction) if part]
+
     def inside(self, strength: float) -> float:
         """Return the strength within what a fit may try: twice the plausible range.
 
@@ -98,7 +103,7 @@ class Unit:
 
     def joint(self, robot: Robot) -> int:
         """Return the joint at which it acts, -1 where there is none or there are several."""
-        targets = [i for i, part in enumerate(self.direction) if part]
+        targets = self.targets
         return self.effect.joint(robot, targets[0]) if len(targets) == 1 else -1
 
     def measured_in(self, robot: Robot) -> str:

@@ -134,8 +134,7 @@ def _joints(unit: Unit, robot: Robot) -> set[int | str]:
     if len(robot.joints) == 1 and -1 not in robot.channel_joint:
         return {0}  # a tilt, too
     targets = unit.effect.targets(robot)
-    places = [at for at, part in enumerate(unit.direction) if part]
-    joints = {at: unit.effect.joint(robot, at) for at in places}
+    joints = {at: unit.effect.joint(robot, at) for at in unit.targets}
     return {targets[at] if joint < 0 else joint for at, joint in joints.items()}
 
 
