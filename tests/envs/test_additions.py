@@ -3,10 +3,12 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import GymEnv
 
 from torchrl_bayessim.envs.additions import rollout_with, steps_with
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.envs.stepper import Stepper
+from torchrl_bayessim.transforms.simulators import add_every_time_step
 
 SLEDGE = """
 <mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body>
@@ -75,7 +77,32 @@ def test_an_addition_of_nothing_changes_no_bit():
         assert torch.equal(one["observation"], two["observation"])
 
 
-def test_a_task_with_commands_of_its_own_takes_no_additions():
-    env = BatchedMujocoEnv("FetchReach-v4", 1, threads=1)
-    with pytest.raises(ValueError, match="a task whose commands are its controls"):
-        env.add("nothing", lambda now: {})
+@pytest.mark.parametrize("name", ["FetchPush-v4", "FetchPickAndPlace-v4"])
+def test_a_command_is_held_over_all_time_steps_of_a_hand_that_is_dragged(name):
+    """It steps from where hand and fingers were when it came; fingers are pinned at the end."""
+    plain, other = (BatchedMujocoEnv(name, 2, threads=1) for _ in range(2))
+    other.add("nothing", lambda now: {"qfrc_applied": torch.zeros_like(now.qvel)})
+    plain.reset(), other.reset()
+    actions = torch.rand(10, 2, 4, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    for action in actions:
+        some = TensorDict({"action": action}, [2])
+        one, two = (env.step(some.clone())["next"] for env in (plain, other))
+        assert torch.equal(one["observation"], two["observation"])
+
+
+def test_a_force_on_a_dragged_arm_is_that_of_the_single_simulator():
+    arm, force = "robot0:elbow_flex_joint", 40.0
+    batch = BatchedMujocoEnv("FetchReach-v4", 1, threads=1)
+    single = GymEnv("FetchReach-v4")
+    push = torch.zeros(1, batch.task.model.nv)
+    push[0, batch.task.model.joint(arm).dofadr[0]] = force
+    first = batch.reset()["observation"].clone()
+    batch.add("push", lambda now: {"qfrc_applied": push.double()})
+    add_every_time_step(single, "push", lambda now: {"qfrc_applied": push[0].double()})
+    single.reset()
+    action = torch.tensor([0.2, -0.5, 0.1, 0.0])
+    for _ in range(4):
+        one = batch.step(TensorDict({"action": action[None]}, [1]))["next", "observation"][0]
+        two = single.step(TensorDict({"action": action}, []))["next", "observation"]
+    assert (one - first[0]).abs().max() > 1e-3
+    torch.testing.assert_close(one.double(), two.double(), atol=1e-6, rtol=0.0)

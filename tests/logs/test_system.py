@@ -1,5 +1,7 @@
 """A system is described once, in a file or in Python, and every slip is named."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -233,5 +235,12 @@ def test_a_system_must_fit_together():
     task = known_task("Hopper-v5")
     with pytest.raises(ValueError, match="a prior over the physics"):
         System(task=task, physics=MujocoPhysics("body_mass[torso]"))
-    with pytest.raises(ValueError, match="whose actions are the controls"):
-        System(task=known_task("FetchReach-v4"))
+
+
+def test_logs_of_a_task_that_converts_its_actions_hold_these():
+    system = System(task=known_task("FetchReach-v4"))
+    assert list(system.columns.ctrl) == ["action0", "action1", "action2", "action3"]
+    assert system.robot.actuators == tuple(system.columns.ctrl)
+    columns = replace(system.columns, ctrl={"hand": "u"})
+    with pytest.raises(ValueError, match=r"an actuator in columns\.ctrl, got 'hand'.*action0"):
+        System(task=known_task("FetchReach-v4"), columns=columns)

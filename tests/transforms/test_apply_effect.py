@@ -366,9 +366,23 @@ def test_effects_on_the_simulator_do_not_go_around_batched_environments():
                   joint_of_actuator=(-1, -1, -1))  # fmt: skip
     env = TransformedEnv(serial, ApplyEffect("action_delay", 0.008, robot=robot))
     assert env.rollout(3).batch_size == (2, 3)
-    with pytest.raises(ValueError, match="commands are its controls"):
-        TransformedEnv(BatchedMujocoEnv("FetchPush-v4", 1, threads=1),
-                       ApplyEffect("constant_force", 0.1))  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["action_delay", "action_gain", "dead_band"])
+def test_effects_on_actions_that_move_a_hand_are_the_same_around_both_simulators(name):
+    actions = torch.rand(8, 4, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    seen = []
+    for make in (lambda: BatchedMujocoEnv("FetchReach-v4", 1, threads=1),
+                 lambda: GymEnv("FetchReach-v4")):  # fmt: skip
+        transform = ApplyEffect(name, 0.06 if name == "action_delay" else 0.2)
+        env = TransformedEnv(make(), transform)
+        assert transform.robot.actuators == ("action0", "action1", "action2", "action3")
+        env.reset()
+        batch = env.batch_size
+        for action in actions:
+            after = env.step(TensorDict({"action": action.expand(*batch, 4).clone()}, batch))
+        seen.append(after["next", "observation"].flatten().double())
+    torch.testing.assert_close(*seen, atol=1e-6, rtol=0.0)
 
 
 def test_an_environment_stepped_in_another_way_has_no_place_for_forces():

@@ -221,7 +221,7 @@ def _check_log(log: Log, system: System) -> None:
         "time": (length,),
         "qpos": (length, model.nq),
         "qvel": (length, model.nv),
-        "ctrl": (length, model.nu),
+        "ctrl": (length, len(system.task.action_names)),
         "velocity_gain": (model.nv,),
         "measured": (2 * model.nv,),
     }

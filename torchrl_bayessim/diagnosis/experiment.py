@@ -138,10 +138,7 @@ def _runs(
     steps = min(_STEPS, round(_SECONDS / dt))
     commands = torch.cat([log.ctrl for log in logs]).numpy()
     low, high = commands.min(0), commands.max(0)
-    model = prepared.predictor.system.task.model
-    limited = model.actuator_ctrllimited.astype(bool)
-    least = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf)
-    most = np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
+    least, most = prepared.predictor.system.task.action_bounds
     names, waves = [], []
     for amplitude in _AMPLITUDES:
         middle, half = (low + high) / 2, amplitude * (high - low) / 2

@@ -29,6 +29,7 @@ from ..effects.effect import (
 )
 from ..effects.fields import ModelFields
 from ..effects.forcing import Forcing
+from ..envs.held_command import HeldCommand
 from ..envs.model_batch import ModelBatch
 from ..envs.stepper import Stepper
 from ..envs.task import Readings
@@ -205,9 +206,10 @@ class Predictor:
     ) -> Array:
         """Return what follows from the start states, shape ``(P, S, H, outputs)``."""
         count, size, horizon = len(theta), len(segments), segments.horizon
-        commands, sequence = commanded(
+        actions, sequence = commanded(
             self.system.robot, segments, strengths, count, seed=self.realisation
         )
+        commands = self._converted(actions)
         self._write(theta, strengths)
         stepper, at = self._stepper, segments.history
         if stepper.num_envs != count * size:
@@ -233,6 +235,8 @@ class Predictor:
             if isinstance(effect, ForceEffect):
                 hooked |= values.any(1)
         rows = np.arange(count * size).reshape(count, size)
+        if stepper.welded:
+            self._place_welds()
         self.steps += count * size * horizon * self.substeps
         free = rows[~hooked].reshape(-1)
         if len(free):
@@ -254,6 +258,13 @@ class Predictor:
                 simulated=simulated,
             )
         return simulated.reshape(count, size, horizon, -1)
+
+    def _converted(self, actions: Array) -> Array:
+        """Return the commands that the task makes of actions."""
+        convert = self.system.task.command
+        if convert is None:
+            return actions
+        return np.ascontiguousarray(convert(torch.from_numpy(actions)).numpy())
 
     def _push(
         self,
@@ -277,8 +288,9 @@ class Predictor:
         parts = self.substeps if self.exact else fewest_parts(self.substeps, self.system.task.dt)
         held = self.system.task.dt / parts
         for t in range(segments.horizon):
-            ctrl = torch.from_numpy(commands[:, t])
-            for _ in range(parts):
+            ctrl = torch.from_numpy(commands[:, t, : stepper.models.model.nu])
+            kept = HeldCommand(stepper, rows)
+            for left in reversed(range(parts)):
                 state = {n: torch.from_numpy(stepper[n][rows]) for n in ("qpos", "qvel", "time")}
                 added, memories = self._forcing(
                     active, memories, Readings(**state, ctrl=ctrl), timestep=held
@@ -288,13 +300,33 @@ class Predictor:
                         models.table[np.ix_(rows, at)] = nominal[name] + added[name].numpy()
                 if "qfrc_applied" in added:
                     stepper["qfrc_applied"][rows] = added["qfrc_applied"].numpy()
-                command[rows, 0] = ctrl + added["ctrl"] if "ctrl" in added else ctrl
+                command[rows, 0] = kept.again(commands[:, t])
+                if "ctrl" in added:
+                    command[rows, 0, : ctrl.shape[1]] += added["ctrl"].numpy()
                 now = rows[alive]
                 stepper.rollout(
-                    command, substeps=self.substeps // parts, rows=now, outputs=stepper.outputs
+                    command,
+                    substeps=self.substeps // parts,
+                    rows=now,
+                    outputs=stepper.outputs,
+                    ends=not left,
                 )
                 alive[alive] = stepper.status[now] == 0
             simulated[rows[alive], t] = stepper.outputs[rows[alive], 0]
+
+    def _place_welds(self) -> None:
+        """Let the first command step from where the welded body is in each start state.
+
+        As it stood at the beginning of the last time step, where nothing evaluates it anew.
+        """
+        stepper, drive = self._stepper, self.system.task.drive
+        starts = stepper.state.copy()
+        if not drive.pinned:
+            back = -float(stepper.models.model.opt.timestep) * stepper["qvel"]
+            stepper["qpos"][:] = self.tangent.displace(stepper["qpos"], back)
+        stepper.begin()
+        starts[:, stepper.components["weld_pose"]] = stepper["weld_pose"]
+        stepper.state[:] = starts
 
     def _warm(
         self, segments: Segments, active: Sequence[tuple[ForceEffect, Tensor]], count: int

@@ -212,7 +212,10 @@ class _Dynamics:
         step = np.einsum("nij,nj->ni", gain, innovation)
         distance = np.einsum("ni,nij,nj->n", innovation, inverse, innovation)
         density = -0.5 * (np.minimum(distance, _LOST) + np.linalg.slogdet(spread)[1])
-        covariance = _symmetric(belief.covariance - gain @ seen)
+        # Joseph's form: unlike P - K H P it cannot lose its sign where sensors are very good
+        kept = np.eye(seen.shape[2]) - gain @ np.eye(seen.shape[2])[channels]
+        noise = (gain * self.noise**2) @ gain.swapaxes(1, 2)
+        covariance = _symmetric(kept @ belief.covariance @ kept.swapaxes(1, 2) + noise)
         return _displaced(self.predictor, belief, step, covariance), density
 
     def moved(self, belief: Beliefs, t: int) -> tuple[Beliefs, Array]:

@@ -35,7 +35,8 @@ class Robot:
 
     Attributes:
         dt: Seconds per control step.
-        actuators: Names of the ``A`` commands.
+        actuators: Names of the ``A`` commands: of actuators, or ``action0`` and so on where a task
+            makes something else of its actions.
         command_scale: Largest command of each, shape ``(A,)``.
         joints: Names of the ``J`` hinges and slides.
         force_scale: A typical largest generalised force at each joint, N m or N, shape ``(J,)``.
@@ -114,17 +115,17 @@ def robot_of(task: Task) -> Robot:
     if model.njnt == 0:
         raise ValueError(message("a model with joints", "none", hint="add <joint> to a body"))
     scalar = [j for j in range(model.njnt) if model.jnt_type[j] >= _SLIDE]
-    joints = tuple(_name(model.joint(j).name, "joint", j) for j in scalar)
+    joints = tuple(model.joint(j).name or f"joint{j}" for j in scalar)
     qpos = tuple(int(model.jnt_qposadr[j]) for j in scalar)
     dofs = tuple(int(model.jnt_dofadr[j]) for j in scalar)
-    actuators = tuple(_name(model.actuator(i).name, "actuator", i) for i in range(model.nu))
-    moved = [_moved_joint(model, i) for i in range(model.nu)]
+    # what actions are converted to is not the force of one joint
+    moved = [-1 if task.converts else _moved_joint(model, i) for i in range(len(task.action_names))]
     position = torch.tensor([_span(model, j) for j in scalar], dtype=torch.float64)
     velocity = position / 0.25
     return Robot(
         dt=task.dt,
-        actuators=actuators,
-        command_scale=torch.tensor([_command_scale(model, i) for i in range(model.nu)]).double(),
+        actuators=task.action_names,
+        command_scale=_action_scale(task),
         joints=joints,
         force_scale=_force_scale(model, scalar),
         position_scale=position,
@@ -138,10 +139,6 @@ def robot_of(task: Task) -> Robot:
         dof_index=dofs,
         model=model,
     )
-
-
-def _name(name: str, kind: str, number: int) -> str:
-    return name or f"{kind}{number}"
 
 
 def _moved_joint(model: mujoco.MjModel, actuator: int) -> int:
@@ -162,6 +159,11 @@ def _command_scale(model: mujoco.MjModel, actuator: int) -> float:
     if model.actuator_ctrllimited[actuator]:
         return float(np.abs(model.actuator_ctrlrange[actuator]).max())
     return 1.0
+
+
+def _action_scale(task: Task) -> Tensor:
+    largest = np.abs(np.stack(task.action_bounds)).max(0)
+    return torch.from_numpy(np.where(np.isfinite(largest), largest, 1.0))
 
 
 def _force_scale(model: mujoco.MjModel, joints: list[int]) -> Tensor:

@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .held_command import HeldCommand
 from .stepper import Stepper
 
 Addition = Callable[[SimpleNamespace], Mapping[str, Tensor]]
@@ -34,29 +35,31 @@ def rollout_with(
     Args:
         stepper: The simulations; those that diverge stay in the state before that time step.
         additions: In their order.
-        commands: Shape ``(N, T, nu)``.
+        commands: Shape ``(N, T, C)``; what is added to them, to their controls.
         substeps: Time steps per command.
 
     Returns:
         The outputs after each command, shape ``(N, T, M)``; NaN after a divergence.
     """
-    models, count = stepper.models, stepper.models.model.nv
+    models, count, nu = stepper.models, stepper.models.model.nv, stepper.models.model.nu
     base = {f: [models.read(f, (d,)) for d in range(count)] for f in _FIELDS}
     applied = stepper["qfrc_applied"].copy()
     rows = np.arange(stepper.num_envs)
     outputs = np.full((*commands.shape[:2], stepper.output_size), np.nan)
     after = np.empty((stepper.num_envs, 1, stepper.output_size))
     for t in range(commands.shape[1]):
-        for _ in range(substeps):
+        held = HeldCommand(stepper, np.arange(stepper.num_envs))
+        for left in reversed(range(substeps)):
             names = "qpos", "qvel", "time"
             state = {name: torch.from_numpy(stepper[name]) for name in names}
-            added = _total(additions, ctrl=torch.from_numpy(commands[:, t]), **state)
+            added = _total(additions, ctrl=torch.from_numpy(commands[:, t, :nu]), **state)
             stepper["qfrc_applied"][:] = applied + added.get("qfrc_applied", 0.0)
             for field in _FIELDS:
                 for d, value in enumerate(base[field] if field in added else ()):
                     models.write(field, (d,), value + added[field][:, d])
-            command = commands[:, t] + added.get("ctrl", 0.0)
-            stepper.rollout(command[:, None], substeps=1, rows=rows, outputs=after)
+            command = held.again(commands[:, t]).copy()
+            command[:, :nu] += added.get("ctrl", 0.0)
+            stepper.rollout(command[:, None], substeps=1, rows=rows, outputs=after, ends=not left)
             rows = rows[stepper.status[rows] == 0]
         outputs[rows, t] = after[rows, 0]
     stepper["qfrc_applied"][:] = applied

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["Drive", "resolved"]
+__all__ = ["Drive", "Resolved", "resolved"]
 
 from dataclasses import dataclass
 
@@ -11,6 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import message
+
+Resolved = tuple[NDArray[np.int64], int, NDArray[np.int64], NDArray[np.int64], bool]
+"""The same for compiled code: addresses of ``relative``, ``weld``, ``pinned`` and of sites read."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +37,7 @@ class Drive:
     contact_forces: bool = False
 
 
-def resolved(
-    model: mujoco.MjModel, drive: Drive, sites: list[str]
-) -> tuple[NDArray[np.int64], int, NDArray[np.int64], NDArray[np.int64], bool]:
+def resolved(model: mujoco.MjModel, drive: Drive, sites: list[str]) -> Resolved:
     """Return the ``drive`` argument of the kernels: names replaced by addresses."""
     relative = np.full(model.nu, -1, dtype=np.int64)
     for actuator in drive.relative:

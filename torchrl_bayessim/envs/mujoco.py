@@ -144,15 +144,7 @@ class BatchedMujocoEnv(EnvBase):
         return self._started()
 
     def add(self, key: object, addition: Addition) -> None:
-        """Call ``addition`` before every time step from now on, in place of the one of that key.
-
-        Raises:
-            ValueError: The task's commands are not its controls.
-        """
-        drive = self.task.drive
-        if drive.relative or drive.weld is not None or drive.pinned:
-            expected = "a task whose commands are its controls, to add to them every time step"
-            raise ValueError(message(expected, drive))
+        """Call ``addition`` before every time step from now on, in place of the one of that key."""
         self._additions[key] = addition
 
     @contextmanager

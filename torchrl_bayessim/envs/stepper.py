@@ -14,6 +14,7 @@ import os
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from ..errors import SimulationError, message
 from . import native
 from .components import check_counts, components_of, names_of
-from .drive import Drive, resolved
+from .drive import Drive, Resolved, resolved
 from .fatal_errors import fault_text
 from .model_batch import ModelBatch
 from .threads import Threads
@@ -69,6 +70,8 @@ class Stepper:
         status: What became of each simulation in the last call that included it: 0, or
             `native.DIVERGED`, ``OVERFLOW`` or ``FAILED`` (which are errors too), shape ``(N,)``.
         command_size: Numbers in a command.
+        relative: Where in ``qpos`` is what each control is added to, -1 for none, shape ``(nu,)``.
+        welded: Whether commands step a mocap body from the pose of the body that it drags.
     """
 
     def __init__(
@@ -101,6 +104,8 @@ class Stepper:
         self._pace = 1e-5  # s per time step, as last seen
         self._queue = np.zeros(1, dtype=np.int64)
         self._drive = resolved(model, drive, sites)
+        self._inside = resolved(model, replace(drive, pinned=(), contact_forces=False), sites)
+        self.relative, self.welded = self._drive[0], drive.weld is not None
         self._sharing = sharing
         self.command_size = model.nu + (0 if drive.weld is None else 7)
         self.layout = layout(self._workers[0].data, arrays + tuple(sites))
@@ -164,7 +169,7 @@ class Stepper:
         rows = self._all if rows is None else _within(rows, self.num_envs, "simulations")
         outputs = self.outputs[:, 0] if outputs is None else outputs
         _check_room(outputs, rows, (self.output_size,))
-        self._run(native.begin, rows, outputs, steps=len(rows))
+        self._run(native.begin, rows, outputs, drive=self._drive, steps=len(rows))
 
     def rollout(
         self,
@@ -175,6 +180,7 @@ class Stepper:
         rows: NDArray[np.int64] | None = None,
         outputs: NDArray[np.float64] | None = None,
         meanwhile: Callable[[], None] | None = None,
+        ends: bool = True,
     ) -> NDArray[np.float64]:
         """Apply sequences of commands, each held for ``substeps`` steps.
 
@@ -186,6 +192,8 @@ class Stepper:
             rows: Which simulations to advance; default all.
             outputs: Where to write; default a new array.
             meanwhile: What this thread does while others step; None to step with them.
+            ends: Whether what follows a control step does: pinning joints, contact forces. Not
+                where this is a part of one that goes on.
 
         Returns:
             The outputs after each command, shape ``(N, T, M)``: NaN after a divergence, anything in
@@ -211,7 +219,10 @@ class Stepper:
         commands = np.asarray(commands, dtype=np.float64)
         arguments = commands, sequence, substeps
         steps = len(rows) * commands.shape[1] * substeps
-        self._run(native.advance, rows, outputs, *arguments, steps=steps, meanwhile=meanwhile)
+        drive = self._drive if ends else self._inside
+        self._run(
+            native.advance, rows, outputs, *arguments, drive=drive, steps=steps, meanwhile=meanwhile
+        )
         return outputs
 
     def _run(
@@ -220,6 +231,7 @@ class Stepper:
         rows: NDArray[np.int64],
         outputs: NDArray[np.float64],
         *arguments: object,
+        drive: Resolved,
         steps: int,
         meanwhile: Callable[[], None] | None = None,
     ) -> None:
@@ -230,7 +242,7 @@ class Stepper:
         wait(self._running)  # after an interrupt
         self._queue[0] = 0
         batch = self.models.table, self._sharing, self.state, _SIGNATURE
-        shared = self._drive, self._queue, rows, outputs, self.status, *arguments
+        shared = drive, self._queue, rows, outputs, self.status, *arguments
         most = max(1, int(steps * self._pace / _HANDING_OVER))
         calls = []
         for worker in self._workers[:most]:

@@ -119,6 +119,37 @@ class Task:
         """Seconds per control step in the nominal physics; ``readings.dt`` are those in force."""
         return self.model.opt.timestep * self.frame_skip
 
+    @property
+    def converts(self) -> bool:
+        """Whether an action is something else than the controls of the actuators."""
+        return self.command is not None or self.drive.weld is not None
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """What the numbers of an action are called: the actuators, or ``action0`` and so on.
+
+        Example:
+            >>> from torchrl_bayessim.envs.tasks.catalogue import known_task
+            >>> known_task("InvertedPendulum-v5").action_names
+            ('slide',)
+            >>> known_task("FetchPush-v4").action_names
+            ('action0', 'action1', 'action2', 'action3')
+        """
+        if self.converts:
+            return tuple(f"action{i}" for i in range(len(self.action_bounds[0])))
+        named = (self.model.actuator(i).name for i in range(self.model.nu))
+        return tuple(name or f"actuator{i}" for i, name in enumerate(named))
+
+    @property
+    def action_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lowest and highest action, infinite where there is no bound, shape ``(A,)`` each."""
+        if self.bounds is not None:
+            return self.bounds
+        unlimited = self.model.actuator_ctrllimited == 0
+        low, high = (np.array(end) for end in self.model.actuator_ctrlrange.T)
+        low[unlimited], high[unlimited] = -np.inf, np.inf
+        return low, high
+
     def verify(self, now: Readings, action: Tensor) -> None:
         """Evaluate reward and termination once, to see whether they are as they should be.
 

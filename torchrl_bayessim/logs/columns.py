@@ -9,7 +9,7 @@ each measured tangent coordinate is a *channel*.
 
 from __future__ import annotations
 
-__all__ = ["Channel", "Columns", "actuator_names", "channels", "default_columns", "joint_names"]
+__all__ = ["Channel", "Columns", "channels", "default_columns", "joint_names"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import mujoco
 
+from ..envs.task import Task
 from ..errors import message
 
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
@@ -32,7 +33,8 @@ class Columns:
         time: Seconds; ``None`` where rows follow each other at the control step.
         qpos: By joint, one name per number; joints that were not measured are missing.
         qvel: By joint; where missing, velocities are estimated from positions.
-        ctrl: By actuator, of all actuators.
+        ctrl: By actuator, of all actuators; of a task that converts its actions, by ``action0``
+            and so on.
     """
 
     time: str | None
@@ -40,14 +42,15 @@ class Columns:
     qvel: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     ctrl: Mapping[str, str] = field(default_factory=dict)
 
-    def check(self, model: mujoco.MjModel) -> None:
-        """Check the names of joints and actuators against a model.
+    def check(self, task: Task) -> None:
+        """Check the names of joints and actuators against a simulator.
 
         Raises:
             ValueError: There is no such joint or actuator, one has another number of columns, an
                 actuator or all positions are missing, or a column is named twice.
         """
-        joints, actuators = joint_names(model), actuator_names(model)
+        model = task.model
+        joints, actuators = joint_names(model), task.action_names
         for kind, given in ("qpos", self.qpos), ("qvel", self.qvel):
             widths = _POSITIONS if kind == "qpos" else _VELOCITIES
             for joint, names in given.items():
@@ -93,27 +96,23 @@ def joint_names(model: mujoco.MjModel) -> list[str]:
     return [model.joint(j).name or f"joint{j}" for j in range(model.njnt)]
 
 
-def actuator_names(model: mujoco.MjModel) -> list[str]:
-    """Return the actuators' names, ``actuator3`` for the nameless fourth."""
-    return [model.actuator(i).name or f"actuator{i}" for i in range(model.nu)]
-
-
-def default_columns(model: mujoco.MjModel) -> Columns:
+def default_columns(task: Task) -> Columns:
     """Return columns that are named after joints and actuators, and ``time``.
 
     Example:
         >>> model = mujoco.MjModel.from_xml_string(
         ...     "<mujoco><worldbody><body><joint name='knee'/><geom size='.1'/></body></worldbody>"
         ...     "<actuator><motor name='motor' joint='knee'/></actuator></mujoco>")
-        >>> default_columns(model).used()
+        >>> default_columns(Task(model=model, frame_skip=1)).used()
         ['time', 'knee position', 'knee velocity', 'motor']
     """
+    model = task.model
     qpos, qvel = {}, {}
     for j, name in enumerate(joint_names(model)):
         kind = int(model.jnt_type[j])
         qpos[name] = tuple(f"{name} {c}" for c in _POSITIONS.get(kind, ("position",)))
         qvel[name] = tuple(f"{name} {c}" for c in _VELOCITIES.get(kind, ("velocity",)))
-    return Columns("time", qpos, qvel, {name: name for name in actuator_names(model)})
+    return Columns("time", qpos, qvel, {name: name for name in task.action_names})
 
 
 def channels(model: mujoco.MjModel, columns: Columns) -> list[Channel]:

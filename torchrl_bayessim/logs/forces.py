@@ -36,7 +36,7 @@ def check_forces(
 ) -> Iterator[Finding]:
     """Yield what is wrong with the actions, given each record's logs."""
     model = system.task.model
-    if model.nu == 0 or model.na > 0 or system.task.drive.relative:
+    if model.nu == 0 or model.na > 0 or system.task.drive.relative or system.task.converts:
         return
     half = max(2, round(_WINDOW / system.control_dt / 2))
     moved = [

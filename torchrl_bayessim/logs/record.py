@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import message
-from .columns import actuator_names, joint_names
+from .columns import joint_names
 from .system import System
 from .tables import Table
 
@@ -27,7 +27,7 @@ class Record:
         time: Seconds since the first row, shape ``(T,)``; NaN where it is no time.
         qpos: Shape ``(T, nq)``; quaternions are normalised and do not change sign between rows.
         qvel: Shape ``(T, nv)``.
-        ctrl: The action held from each row on, shape ``(T, nu)``.
+        ctrl: The action held from each row on, shape ``(T, A)``.
     """
 
     name: str
@@ -52,7 +52,7 @@ def record_of(table: Table, system: System) -> Record:
         raise ValueError(message(f"rows in {table.name}", 0))
     qpos = np.full((length, model.nq), np.nan)
     qvel = np.full((length, model.nv), np.nan)
-    ctrl = np.full((length, model.nu), np.nan)
+    ctrl = np.full((length, len(system.task.action_names)), np.nan)
     for j, joint in enumerate(joint_names(model)):
         for i, name in enumerate(columns.qpos.get(joint, ())):
             qpos[:, model.jnt_qposadr[j] + i] = table.columns[name]
@@ -62,7 +62,7 @@ def record_of(table: Table, system: System) -> Record:
             place = slice(qpos_end := model.jnt_qposadr[j] + len(columns.qpos[joint]) - 4, None)
             quaternions = qpos[:, place][:, :4]
             qpos[:, qpos_end : qpos_end + 4] = _continuous(quaternions, table.name, joint)
-    for i, actuator in enumerate(actuator_names(model)):
+    for i, actuator in enumerate(system.task.action_names):
         ctrl[:, i] = table.columns[columns.ctrl[actuator]]
     if columns.time is None:
         time = system.control_dt * np.arange(length, dtype=np.float64)

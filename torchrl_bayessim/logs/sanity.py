@@ -15,7 +15,6 @@ from itertools import groupby
 import numpy as np
 
 from ..errors import message
-from .columns import actuator_names
 from .finding import Finding
 from .forces import check_forces
 from .kinematics import check_channels, lattice_step, motions
@@ -182,8 +181,7 @@ def _resolution(records: Sequence[Record], system: System) -> Iterator[Finding]:
 
 
 def _actions(records: Sequence[Record], system: System) -> Iterator[Finding]:
-    model = system.task.model
-    for i, name in enumerate(actuator_names(model)):
+    for i, name in enumerate(system.task.action_names):
         every = [r.ctrl[:, i][plausible(r.ctrl[:, i])] for r in records]
         values = [v for v in every if len(v)]
         constant = [r for r, v in zip(records, every, strict=True) if len(v) and np.ptp(v) == 0]
@@ -192,9 +190,9 @@ def _actions(records: Sequence[Record], system: System) -> Iterator[Finding]:
             yield _general("constant_action", text)
         else:
             yield from (_whole("constant_action", record, text) for record in constant)
-        low, high = model.actuator_ctrlrange[i]
+        low, high = (float(end[i]) for end in system.task.action_bounds)
         largest = max((np.abs(v).max() for v in values), default=0.0)
-        if model.actuator_ctrllimited[i] and largest > 1.5 * max(-low, high):
+        if np.isfinite(high) and largest > 1.5 * max(-low, high):
             text = f"the action {name} reaches {largest:.3g}, and the model clips it to {high:.3g}"
             # no controller asks for as much; of a part that is odd, other checks know more
             wrong = np.median(np.abs(np.concatenate(values))) > _NO_COMMAND * max(-low, high)

@@ -21,7 +21,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import actuator_names
 from .finding import Finding
 from .inverse_dynamics import Dynamics, Fit, actuated_joints, fit_terms, held, moves
 from .system import System
@@ -112,7 +111,7 @@ def _left(one: Dynamics, dof: int, fit: Fit) -> float:
 
 
 def _finding(order: Order, system: System, one: Dynamics | None = None) -> Finding:
-    names = actuator_names(system.task.model)
+    names = system.task.action_names
     *first, last = (system.columns.ctrl[names[i]] for i in sorted(order))
     what = "swapped" if len(order) == 2 else "in another order"
     text = f"actions {', '.join(first)} and {last} {what}? Only so do they explain the motion"

@@ -65,7 +65,7 @@ class System:
         (0, 1, 2, 3)
 
     Attributes:
-        task: The simulator; its actions are the model's controls.
+        task: The simulator; logs hold its actions.
         columns: What the columns of logs hold; default: names of joints and actuators.
         physics: What is uncertain but modelled.
         prior: The prior over it.
@@ -75,8 +75,7 @@ class System:
     Raises:
         TypeError: A part is of another kind.
         ValueError: The columns or the noise do not fit the model, the prior is over other
-            parameters than the physics or over the time step, an effect is named twice, or the
-            task's actions are not its controls.
+            parameters than the physics or over the time step, or an effect is named twice.
         PhysicsError: The model has no such parameter.
     """
 
@@ -89,18 +88,14 @@ class System:
 
     def __post_init__(self) -> None:
         check_kind("a task", self.task, Task)
-        model = self.task.model
         if self.columns is None:
-            object.__setattr__(self, "columns", default_columns(model))
+            object.__setattr__(self, "columns", default_columns(self.task))
         check_kind("columns of logs", self.columns, Columns)
         for part, kind in (self.physics, MujocoPhysics), (self.prior, BoxPrior):
             if part is not None:
                 check_kind(f"a {kind.__name__} or None", part, kind)
         check_kind("deviations of noise by channel", self.noise, Mapping)
-        self.columns.check(model)
-        if self.task.command is not None or self.task.drive.weld is not None:
-            expected = "a task whose actions are the controls of its actuators"
-            raise ValueError(message(expected, "one that converts actions"))
+        self.columns.check(self.task)
         names = None if self.prior is None else self.prior.names
         physics = None if self.physics is None else self.physics.names
         if names != physics:

@@ -20,12 +20,12 @@ from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
-import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
+from ..envs.task import Task
 from ..errors import message
 from .columns import default_columns
 from .memory_maps import saved_tensordict
@@ -289,7 +289,7 @@ def _table(name: str, arrays: Mapping[str, NDArray[Any]], system: System) -> Tab
         columns |= {f"{key}[{i}]": flat[:, i] for i in range(flat.shape[1])}
         if value.ndim == 1 or flat.shape[1] == 1:
             columns[key] = flat[:, 0]
-        columns |= _by_joint(key.rpartition(".")[2], flat, system.task.model)
+        columns |= _by_joint(key.rpartition(".")[2], flat, system.task)
     names, time = system.columns.used(), system.columns.time
     if time is not None and time not in columns:
         if not arrays:
@@ -302,8 +302,8 @@ def _table(name: str, arrays: Mapping[str, NDArray[Any]], system: System) -> Tab
     return Table(name, {key: columns[key].astype(np.float64) for key in names})
 
 
-def _by_joint(key: str, flat: NDArray[Any], model: mujoco.MjModel) -> dict[str, NDArray[Any]]:
-    columns = default_columns(model)
+def _by_joint(key: str, flat: NDArray[Any], task: Task) -> dict[str, NDArray[Any]]:
+    columns = default_columns(task)
     names = {
         "qpos": [n for group in columns.qpos.values() for n in group],
         "qvel": [n for group in columns.qvel.values() for n in group],

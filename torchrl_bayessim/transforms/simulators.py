@@ -5,6 +5,7 @@ from __future__ import annotations
 __all__ = ["add_every_time_step", "robot_of_env"]
 
 import copy
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -44,7 +45,13 @@ def robot_of_env(env: Any) -> Robot:
     steps = getattr(inner, "frame_skip", getattr(inner, "n_substeps", None))
     if steps is None and hasattr(inner, "control_timestep"):  # of dm_control
         steps = round(inner.control_timestep() / model.opt.timestep)
-    return robot_of(Task(model=copy.copy(model), frame_skip=steps or 1))
+    robot = robot_of(Task(model=copy.copy(model), frame_skip=steps or 1))
+    size = env.full_action_spec[env.action_key].shape[-1]
+    if size == len(robot.actuators):
+        return robot
+    # it makes something else of its actions, as the Fetch arms do
+    actions = _actions(env)
+    return replace(robot, **actions)
 
 
 def _robot_of_specs(env: EnvBase) -> Robot:
@@ -53,9 +60,14 @@ def _robot_of_specs(env: EnvBase) -> Robot:
     if dt is None:
         expected = "an environment that says how long a control step is"
         raise ValueError(message(expected, type(inner).__name__, hint="pass robot=Robot(dt=…)"))
-    spec = env.full_action_spec[env.action_key]
-    if not spec.dtype.is_floating_point:
+    if not env.full_action_spec[env.action_key].dtype.is_floating_point:
         return Robot(dt=float(dt))
+    return Robot(dt=float(dt), **_actions(env))
+
+
+def _actions(env: EnvBase) -> dict[str, Any]:
+    """Return names and scales of the numbers in an action, which move no joint that is known."""
+    spec = env.full_action_spec[env.action_key]
     size = spec.shape[-1]
     low, high = getattr(spec.space, "low", None), getattr(spec.space, "high", None)
     scale = torch.ones(size, dtype=torch.float64)
@@ -63,7 +75,7 @@ def _robot_of_specs(env: EnvBase) -> Robot:
         most = torch.maximum(low.abs(), high.abs()).double().reshape(-1, size)[0]
         scale = torch.where(most.isfinite() & (most < 1e6), most, scale)
     names = tuple(f"action{i}" for i in range(size))
-    return Robot(dt=float(dt), actuators=names, command_scale=scale, joint_of_actuator=(-1,) * size)
+    return {"actuators": names, "command_scale": scale, "joint_of_actuator": (-1,) * size}
 
 
 def add_every_time_step(env: Any, key: object, addition: Addition) -> None:
@@ -74,7 +86,6 @@ def add_every_time_step(env: Any, key: object, addition: Addition) -> None:
 
     Raises:
         PhysicsError: It is another environment.
-        ValueError: The commands of a batched environment are not its controls.
     """
     if isinstance(env, BatchedMujocoEnv):
         env.add(key, addition)
