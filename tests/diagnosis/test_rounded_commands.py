@@ -73,7 +73,7 @@ def test_rounded_commands_are_found_between_the_strengths_that_all_effects_are_t
     noise, seed, monkeypatch
 ):
     # as where contacts hide what single rows do
-    monkeypatch.setattr(shapes, "_rounding", lambda *_: None)
+    monkeypatch.setattr(shapes, "_rounding", lambda *_, **__: None)
     rng = np.random.default_rng(seed)
     logs = [moved(rng, step=STEP, noise=noise) for _ in range(6)]
     report = diagnose(arm(), None, logs)

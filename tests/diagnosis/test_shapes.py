@@ -48,7 +48,7 @@ def test_of_a_part_of_a_wave_the_mean_belongs_to_it(phase):
     angle = rng.uniform(-0.1, 0.5, 100)
     force = np.sin(5.0 * angle + phase)
     noisy = force + 0.1 * rng.standard_normal(100)
-    rate, found = _sine(noisy, angle, np.arange(2.0, 25.0), offset=False)
+    rate, found = _sine(noisy, np.ones(100), angle, np.arange(2.0, 25.0), offset=False)
     wave = np.sin(rate * angle + found)
     strength = float(wave @ force / (wave @ wave))
     assert strength > 0
@@ -60,7 +60,7 @@ def test_magnets_behind_a_gear_are_seen_however_far_a_hinge_turns(turns):
     rng = np.random.default_rng(0)
     angle = rng.uniform(0.0, 2 * np.pi * turns, 400)
     force = np.sin(6.25 * angle + 0.4) + 0.1 * rng.standard_normal(400)
-    number, _ = _sine(force, angle, _numbers(angle))
+    number, _ = _sine(force, np.ones(400), angle, _numbers(angle))
     assert number == pytest.approx(6.25, abs=0.2)
 
 
@@ -75,7 +75,7 @@ def test_a_constant_is_no_wave():
     rng = np.random.default_rng(0)
     angle = rng.uniform(-0.1, 0.5, 200)
     force = 3.0 + 0.1 * rng.standard_normal(200)
-    assert _sine(force, angle, np.arange(2.0, 25.0), offset=False) is None
+    assert _sine(force, np.ones(200), angle, np.arange(2.0, 25.0), offset=False) is None
 
 
 @pytest.mark.parametrize("seed", [3, 7])
@@ -86,3 +86,18 @@ def test_a_spring_that_is_off_center_is_no_wave(seed):
     logs = [ride(rng, 150, spring, noise=[0.002, 0.02]) for _ in range(6)]
     report = diagnose(cart(), None, logs, effects=SOME)
     assert {effect.name for effect in report.effects} == {"constant_force", "parallel_spring"}
+
+
+def test_a_wave_shows_where_forces_are_sure():
+    """A foot on the ground hides a force that the same foot in the air shows."""
+    rng = np.random.default_rng(0)
+    time = rng.uniform(0.0, 1.2, 200)
+    error = np.where(rng.random(200) < 0.3, 2.0, 40.0)
+    force = 10.0 * np.sin(2 * np.pi * 3.1 * time + 0.4) + error * rng.standard_normal(200)
+    rates = np.arange(0.5, 12.0, 0.1)
+    alike = _sine(force, np.ones(200), 2 * np.pi * time, rates)
+    assert alike is None or abs(alike[0] - 3.1) > 0.3
+    weight = error**-2.0 / np.mean(error**-2.0)
+    rate, phase = _sine(force, weight, 2 * np.pi * time, rates)
+    assert rate == pytest.approx(3.1, abs=0.15)
+    assert phase == pytest.approx(0.4, abs=0.4)

@@ -139,7 +139,7 @@ def signature_curves(objective: Objective, fit: Fit, pushes: list[Unit]) -> dict
     """
     if not pushes:
         return {}
-    force = missing_force(objective, fit.point, pushes)
+    force, _ = missing_force(objective, fit.point, pushes)
     segments, robot = objective.segments, objective.predictor.system.robot
     middle = segments.history + segments.horizon // 2
     curves: dict[str, Any] = {}
@@ -159,8 +159,13 @@ def signature_curves(objective: Objective, fit: Fit, pushes: list[Unit]) -> dict
     return curves
 
 
-def missing_force(objective: Objective, point: Point, pushes: Sequence[Unit]) -> Array:
-    """Return the constant forces that explain most of each segment's residual, shape ``(S, J)``.
+def missing_force(
+    objective: Objective, point: Point, pushes: Sequence[Unit]
+) -> tuple[Array, Array]:
+    """Return the constant forces that explain most of each segment's residual, and their variances.
+
+    Shapes ``(S, J)``. About contacts the variances differ a thousandfold: a foot in the air shows
+    a force that the same foot on the ground hides.
 
     Args:
         objective: Segments and whitening.
@@ -174,4 +179,6 @@ def missing_force(objective: Objective, point: Point, pushes: Sequence[Unit]) ->
     normal = np.einsum("ism,jsm->sij", slopes, slopes)
     ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12
     right = -np.einsum("ism,sm->si", slopes, innovations)
-    return np.linalg.solve(normal + ridge * np.eye(len(pushes)), right[..., None])[..., 0]
+    covariance = np.linalg.inv(normal + ridge * np.eye(len(pushes)))
+    forces = np.einsum("sij,sj->si", covariance, right)
+    return forces, np.diagonal(covariance, axis1=1, axis2=2)

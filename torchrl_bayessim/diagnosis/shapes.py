@@ -42,6 +42,7 @@ _SLOWEST = 0.5  # cycles per log: slower ones are trends
 _FASTEST = 0.75  # cycles per segment, of which the mean is a third of the largest force
 _FEWEST, _NUMBERS = 2.0, 25.0  # cogs per turn; one is gravity's
 _CLEAR = 0.1  # share of the force's variance that a sine or a step must explain
+_ALIKE = 0.1  # of the median variance of forces
 _FINEST, _GRID = 0.02, 600  # of the largest step that is plausible; steps tried
 
 
@@ -62,7 +63,7 @@ def shaped(
     if not pushes or not logs:
         return []
     system = predictor.system
-    force, time, qpos, ctrl = _missing(
+    force, weight, time, qpos, ctrl = _missing(
         predictor, logs, point=point, noise=noise, pushes=pushes, history=history
     )
     span = float(np.mean([len(log) for log in logs])) * system.control_dt
@@ -73,16 +74,17 @@ def shaped(
         joint = push.joint(system.robot)
         positions = qpos[..., system.robot.qpos_index[joint]]
         found: list[Effect] = []
-        best = _sine(force[:, i], 2 * np.pi * time, frequencies)
+        seen = force[:, i], weight[:, i]
+        best = _sine(*seen, 2 * np.pi * time, frequencies)
         if best is not None:
             found.append(PeriodicDisturbance(frequency=best[0], phase=best[1]))
         rates = (_waves if slides(system.robot, joint) else _numbers)(positions)
         middle = positions[:, _STEPS // 2]
-        best = _sine(force[:, i], middle, rates)
+        best = _sine(*seen, middle, rates)
         if best is not None:
             found.append(Cogging(number=best[0], phase=best[1]))
             if best[0] * np.ptp(positions) < 2 * np.pi:
-                best = _sine(force[:, i], middle, rates, offset=False)
+                best = _sine(*seen, middle, rates, offset=False)
                 found += [] if best is None else [Cogging(number=best[0], phase=best[1])]
         units += [u for u in units_of(found, system.robot) if u.where == push.where]
     for unit in units_of([ActionQuantization()], system.robot):
@@ -90,7 +92,7 @@ def shaped(
         column = next((i for i, p in enumerate(pushes) if p.joint(system.robot) == joint), None)
         if joint < 0 or column is None or unit.where == "all":
             continue
-        step = _rounding(force[:, column], ctrl[..., actuator], unit.high)
+        step = _rounding(force[:, column], weight[:, column], ctrl[..., actuator], most=unit.high)
         if step is not None:
             units.append(at_step(unit, step))
     return units
@@ -109,22 +111,32 @@ def _missing(
     noise: Array,
     pushes: Sequence[Unit],
     history: int,
-) -> tuple[Array, Array, Array, Array]:
-    """Return missing forces ``(S, J)`` of short segments, their times, positions and commands."""
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return missing forces of short segments, how sure each is, times, positions and commands.
+
+    Forces and their weights have shape ``(S, J)``.
+    """
     half = _STEPS // 2
     shifted = [stretch(log, half, len(log)) for log in logs]
     shifted = [log for log in shifted if len(log) > history + _STEPS]
-    forces, seen = [], []
+    forces, variances, seen = [], [], []
     for some in [logs, shifted] if shifted else [logs]:
         pieces = cut(some, _STEPS, history=history, most=_MOST // 2)
         prior = predictor.system.prior
         white = whitening(predictor, pieces, parameters_at(prior, point.z), noise)
-        forces.append(missing_force(Objective(predictor, prior, pieces, white), point, pushes))
+        objective = Objective(predictor, prior, pieces, white)
+        for part, found in zip(
+            (forces, variances), missing_force(objective, point, pushes), strict=True
+        ):
+            part.append(found)
         begin = pieces.history
         window = slice(begin, begin + _STEPS)
         seen.append((pieces.time[:, begin + half], pieces.qpos[:, window], pieces.ctrl[:, window]))
     time, qpos, ctrl = (np.concatenate(part) for part in zip(*seen, strict=True))
-    return np.concatenate(forces), time, qpos, ctrl
+    variance = np.concatenate(variances)
+    # what is wrong beside a constant force errs too, by no more where a force shows best
+    weight = 1.0 / (variance + _ALIKE * np.median(variance, axis=0))
+    return np.concatenate(forces), weight / weight.mean(0), time, qpos, ctrl
 
 
 def with_shapes(units: Sequence[Unit], found: Sequence[Unit]) -> list[Unit]:
@@ -151,13 +163,14 @@ def _numbers(positions: Array) -> Array:
     return np.arange(_FEWEST, _NUMBERS, max(apart, (_NUMBERS - _FEWEST) / _GRID))
 
 
-def _rounding(force: Array, commands: Array, most: float) -> float | None:
+def _rounding(force: Array, weight: Array, commands: Array, *, most: float) -> float | None:
     """Return the step to which commands ``(S, T)`` seem to be rounded, if one stands out."""
-    target = _bounded(force)
+    root = np.sqrt(weight)
+    target = root * _centred(_clipped(force), weight)
     best, choice = _CLEAR * float(target @ target), None
     for step in most * np.geomspace(_FINEST, 1.0, _GRID):
         error = (np.round(commands / step) * step - commands).mean(1)
-        error = error - error.mean()
+        error = root * _centred(error, weight)
         along = float(error @ target)
         if along > 0 and along**2 > best * float(error @ error):
             best, choice = along**2 / float(error @ error), float(step)
@@ -165,24 +178,28 @@ def _rounding(force: Array, commands: Array, most: float) -> float | None:
 
 
 def _sine(
-    force: Array, angle: Array, rates: Array, *, offset: bool = True
+    force: Array, weight: Array, angle: Array, rates: Array, *, offset: bool = True
 ) -> tuple[float, float] | None:
     """Return rate and phase of the sine of the angle that explains most, if it stands out.
 
     Args:
         force: Shape ``(S,)``.
+        weight: How much each counts, shape ``(S,)``.
         angle: Shape ``(S,)``.
         rates: Of the angle, those that are tried.
         offset: Whether the force has a constant beside the sine, which other effects may make. Of
             a wave that is longer than the way, the mean over that is a part of the sine.
     """
+    root = np.sqrt(weight)
     target = _clipped(force)
-    total = float(((target - target.mean()) ** 2).sum())
+    total = float((weight * _centred(target, weight) ** 2).sum())
+    target = root * target
     best, choice = _CLEAR * total, None
     for rate in rates:
         columns = np.stack([np.sin(rate * angle), np.cos(rate * angle)], 1)
         if offset:
             columns = np.c_[columns, np.ones_like(angle)]
+        columns = root[:, None] * columns
         solution, *_ = np.linalg.lstsq(columns, target, rcond=None)
         explained = total - float(((target - columns @ solution) ** 2).sum())
         if explained > best:
@@ -191,13 +208,12 @@ def _sine(
     return choice
 
 
-def _bounded(force: Array) -> Array:
-    """Return the force without its mean and without what short segments make of single rows."""
-    bounded = _clipped(force)
-    return bounded - bounded.mean()
+def _centred(values: Array, weight: Array) -> Array:
+    return values - np.average(values, weights=weight)
 
 
 def _clipped(force: Array) -> Array:
+    """Return the force without what short segments make of single rows."""
     center = np.median(force)
     bound = 4.0 * np.median(np.abs(force - center)) + 1e-12
     return np.clip(force, center - bound, center + bound)
