@@ -33,7 +33,7 @@ from .modes import MODES
 from .objective import Point, Unit, pushes_of, units_of
 from .onsets import with_onsets
 from .preparation import Prepared, prepare
-from .prepared_anew import with_less_noise
+from .prepared_anew import with_less_noise, with_less_trust
 from .report import Report
 from .selection import Selection, select
 from .shapes import SHAPED, shaped, with_shapes
@@ -145,11 +145,16 @@ def _beside_noise(
 ) -> tuple[tuple[str, ...], Prepared, Selection]:
     """Search for effects that last, and on where they leave noise alone, and less than was thought.
 
+    And on where contacts are met by chance beside them, so that little can be told from there.
+
     Returns:
         Alarms before the last search, what it started from, and what it found.
     """
     alarms = prepared.alarms
     prepared, selection = search(prepared)
+    less = with_less_trust(prepared, selection.best.fit.point, generator=generator)
+    if less is not None:
+        prepared, selection = search(less, known=selection)
     if selection.best.mean_square < _NEARLY:
         quieter = with_less_noise(prepared, selection.best.fit.point, generator=generator)
         if quieter is not None:

@@ -14,6 +14,7 @@ from ..effects.transmission import servos
 from ..errors import message
 from ..logs.log import Log
 from ..logs.system import System
+from .chance_contacts import left_to_chance
 from .contacts import likelier, one_sided, settled
 from .hidden import hidden_joints
 from .modes import Mode, Trajectories, shortest
@@ -259,7 +260,16 @@ def _nominal(
         bare = mode.objective(predictor, prior, part, z=z, noise=noise, generator=generator)
         sets[name] = bare.weighted(Point(z))
     sets["train"] = _differing(sets["train"], Point(z))
-    return refit(sets["train"], [Point(z)])[0], sets
+    fit = refit(sets["train"], [Point(z)])[0]
+    if generator is None or type(mode) is not Mode:
+        return fit, sets
+    for _ in range(_ROUNDS):
+        less = left_to_chance(sets, fit.point, noise=noise, generator=generator)
+        if not less:
+            break
+        sets |= less
+        fit = refit(sets["train"], [fit.point])[0]
+    return fit, sets
 
 
 def _differing(objective: Objective, point: Point) -> Objective:

@@ -1,18 +1,21 @@
-"""What a search starts from once it is known what else there is: other logs, or less noise."""
+"""What a search starts from once it is known what else there is: other logs, less noise, chance."""
 
 from __future__ import annotations
 
-__all__ = ["with_less_noise", "with_other_logs"]
+__all__ = ["with_less_noise", "with_less_trust", "with_other_logs"]
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ..logs.log import Log
+from .chance_contacts import left_to_chance
 from .modes import Mode
 from .noise import UNCERTAIN
 from .objective import Point
 from .preparation import Prepared, Started
+from .refit import refit
 
 _QUIETER = 0.87  # times the noise: a quarter of its variance was the missing effect
 
@@ -68,3 +71,25 @@ def with_less_noise(
         predictor, prepared.mode, history, prepared.horizon, noise, source, tuple(alarms)
     )
     return started.fitted(prepared.logs, generator)
+
+
+def with_less_trust(
+    prepared: Prepared, found: Point, *, generator: np.random.Generator
+) -> Prepared | None:
+    """Return the same with what chance makes of contacts beside the effects that were found.
+
+    Nothing where none were found, or chance makes little; see `chance_contacts`.
+
+    Args:
+        prepared: With the covariance at the parameters alone.
+        found: The simulator with the effects.
+        generator: Of the noise that is drawn.
+    """
+    if not found.strengths or type(prepared.mode) is not Mode:
+        return None
+    less = left_to_chance(prepared.sets, found, noise=prepared.noise, generator=generator)
+    if not less:
+        return None
+    sets = {**prepared.sets, **less}
+    nominal = refit(sets["train"], [prepared.nominal.point])[0]
+    return replace(prepared, sets=sets, nominal=nominal)

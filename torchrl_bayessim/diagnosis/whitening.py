@@ -19,9 +19,11 @@ from __future__ import annotations
 __all__ = [
     "ENOUGH",
     "Whitening",
+    "excess",
     "innovation_noise",
     "noise_from_differences",
     "start_deviations",
+    "start_noise",
     "whitening",
 ]
 
@@ -113,7 +115,7 @@ def whitening(
             the time step and noise of its own; rows whose innovations are larger than one there
             (where the linear view of the start's noise fails) are trusted that much less.
     """
-    root = _start_noise(predictor, segments, noise)
+    root = start_noise(predictor, segments, noise)
     offsets = np.concatenate([np.zeros_like(root[:1]), root, -root])
     thetas = np.repeat(theta[None], len(offsets), 0)
     residual = predictor.residuals(segments, thetas, None, offsets)
@@ -139,8 +141,8 @@ def whitening(
         made = moved - finer - (step / 2).reshape(finer.shape)
         made += noise * generator.standard_normal(moved.shape)
         white = np.matmul(inverse, np.nan_to_num(made, nan=_WORST).reshape(_DRAWS, size, -1, 1))
-        excess = _excess((white**2).reshape(_DRAWS, size, checks, channels))
-        inverse /= np.sqrt(np.repeat(excess, channels, axis=1))[..., None]
+        larger = excess((white**2).reshape(_DRAWS, size, checks, channels))
+        inverse /= np.sqrt(np.repeat(larger, channels, axis=1))[..., None]
     variance = np.diagonal(spread, axis1=1, axis2=2).reshape(size, checks, channels)
     bent = np.linalg.norm(curve, axis=(0, 2)) / np.maximum(
         np.linalg.norm(slope, axis=(0, 2)), 1e-12
@@ -149,7 +151,7 @@ def whitening(
     return Whitening(inverse, np.ones(size), np.sqrt(variance), drift, float(np.median(bent)))
 
 
-def _excess(squares: Array) -> Array:
+def excess(squares: Array) -> Array:
     """Return how much larger than one squares of simulated innovations are, 1 at least, ``(S, K)``.
 
     Until something touches the ground a segment is as predictable as the others: so rows that are
@@ -164,7 +166,7 @@ def _excess(squares: Array) -> Array:
     return np.where(loud, rows, np.maximum(others, 1.0)[:, None])
 
 
-def _start_noise(predictor: Predictor, segments: Segments, noise: Array) -> Array:
+def start_noise(predictor: Predictor, segments: Segments, noise: Array) -> Array:
     """Return steps of one standard deviation of the start states, ``(J, S, 2 nv)``.
 
     Their squares sum up to the covariance.

@@ -1,0 +1,110 @@
+"""Where contacts are met by chance, noise makes what a covariance of another simulator denies."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_bayessim.diagnosis.chance_contacts import trusted_less
+from torchrl_bayessim.diagnosis.objective import Objective, Point
+from torchrl_bayessim.diagnosis.prediction import Predictor
+from torchrl_bayessim.diagnosis.segments import cut_for_fits
+from torchrl_bayessim.diagnosis.whitening import whitening
+from torchrl_bayessim.envs.tasks.catalogue import known_task
+from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.logs.log import Log
+from torchrl_bayessim.logs.system import System
+from torchrl_bayessim.physics.mujoco import MujocoPhysics
+from torchrl_bayessim.replay import Replay
+
+NOISE = np.repeat([0.002, 0.02], 9)
+PHYSICS = MujocoPhysics("body_mass[torso]", "dof_damping[bfoot]")
+TRUE, ELSEWHERE = (6.0, 3.0), (6.4, 3.3)
+
+
+def running(seed, damping=TRUE[1]):
+    """Return logs of a robot that runs on its feet, twelve runs of 70 rows."""
+    generator = torch.Generator().manual_seed(seed)
+    held = torch.rand(12, 12, 6, generator=generator) * 2 - 1
+    actions = held.repeat_interleave(6, 1)[:, :70]
+    start = {"qpos": torch.zeros(12, 9), "qvel": torch.zeros(12, 9), "action": actions}
+    robot = Replay("HalfCheetah-v5", start, physics=PHYSICS)
+    moved = robot(torch.tensor([[TRUE[0], damping]]))[0]
+    wide = torch.tensor(NOISE) * torch.randn(12, 70, 18, generator=generator).double()
+    return [
+        Log(
+            name=f"run{i}",
+            time=0.05 * torch.arange(69, dtype=torch.float64),
+            qpos=moved["qpos"][i, :-1] + wide[i, :69, :9],
+            qvel=moved["qvel"][i, :-1] + wide[i, :69, 9:],
+            ctrl=actions[i, 1:].double(),
+            velocity_gain=torch.zeros(9, dtype=torch.float64),
+            measured=torch.ones(18, dtype=torch.bool),
+        )
+        for i in range(12)
+    ]
+
+
+def seen_from_elsewhere(logs):
+    """Return the objective with the covariance at other parameters, and the true ones."""
+    prior = BoxPrior({"body_mass[torso]": (4.5, 9.0), "dof_damping[bfoot]": (1.0, 10.0)})
+    system = System(task=known_task("HalfCheetah-v5"), physics=PHYSICS, prior=prior)
+    predictor = Predictor(system, threads=1)
+    segments = cut_for_fits(logs, 10, history=8, most=70)
+    rng = np.random.default_rng(0)
+    white = whitening(predictor, segments, np.array(ELSEWHERE), NOISE, generator=rng)
+    objective = Objective(predictor, prior, segments, white)
+    low, high = prior.low.numpy(), prior.high.numpy()
+    z = np.sqrt(12) * ((np.array(TRUE) - low) / (high - low) - 0.5)
+    point = Point(np.r_[z, 0.0])
+    np.testing.assert_allclose(objective.theta(point.z[None])[0], TRUE)
+    return objective, point
+
+
+def squares(objective, point):
+    return (objective([point])[0] ** 2).mean(-1)
+
+
+@pytest.mark.parametrize("seed", [3, 10, 14])
+def test_of_clean_data_nothing_but_noise_is_left(seed):
+    objective, point = seen_from_elsewhere(running(seed))
+    before = squares(objective, point)
+    assert before.mean() > 2.0
+    assert before.max() > 20.0
+    less = trusted_less(objective, point, noise=NOISE, generator=np.random.default_rng(1))
+    after = squares(less, point)
+    assert after.mean() < 1.4
+    assert (before[before < 3.0] == after[before < 3.0]).all()
+
+
+def test_what_a_robot_lacks_counts_as_before():
+    objective, point = seen_from_elsewhere(running(0, damping=12.0))
+    before = squares(objective, point)
+    less = trusted_less(objective, point, noise=NOISE, generator=np.random.default_rng(1))
+    after = squares(less or objective, point)
+    assert np.median(before) > 3.0
+    assert np.median(after) > 0.7 * np.median(before)
+
+
+def test_the_same_noise_is_drawn_for_the_same_seed():
+    objective, point = seen_from_elsewhere(running(3))
+    one, two = (
+        trusted_less(objective, point, noise=NOISE, generator=np.random.default_rng(1))
+        for _ in range(2)
+    )
+    np.testing.assert_array_equal(one.whitening.inverse, two.whitening.inverse)
+
+
+def test_a_robot_that_touches_nothing_is_trusted(monkeypatch):
+    objective, point = seen_from_elsewhere(running(0))
+    monkeypatch.setattr(Predictor, "colliding", False)
+    generator = np.random.default_rng(1)
+    assert trusted_less(objective, point, noise=NOISE, generator=generator) is None
+    assert generator.bit_generator.state == np.random.default_rng(1).bit_generator.state
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)

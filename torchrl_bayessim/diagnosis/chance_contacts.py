@@ -1,0 +1,79 @@
+"""Segments in which noise makes as much as is left: whether a foot comes down there is chance.
+
+The covariance of a segment's innovations is a linear view at one simulator. At another one the same
+segment may pass an impact that it missed before, and noise of start and sensors then makes of it
+sixty times what the covariance says: on clean data of a running robot half of what is left sits in
+few such segments. So where much is left, a robot is simulated that *is* the simulator, with noise
+of its own, and rows in which its innovations are larger than one are trusted that much less. What
+the simulator lacks noise does not make, and counts as before.
+"""
+
+from __future__ import annotations
+
+__all__ = ["left_to_chance", "trusted_less"]
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .objective import Objective, Point
+from .whitening import excess, start_noise
+
+Array = NDArray[np.float64]
+_LOUD = 3.0  # mean squared innovation of a segment that is looked at
+_DRAWS = 48
+_MATTERS = 1.5  # times what the covariance says
+
+
+def left_to_chance(
+    sets: Mapping[str, Objective], point: Point, *, noise: Array, generator: np.random.Generator
+) -> dict[str, Objective]:
+    """Return those objectives of which segments are trusted less; see `trusted_less`."""
+    found = {
+        name: trusted_less(objective, point, noise=noise, generator=generator)
+        for name, objective in sets.items()
+    }
+    return {name: objective for name, objective in found.items() if objective is not None}
+
+
+def trusted_less(
+    objective: Objective, point: Point, *, noise: Array, generator: np.random.Generator
+) -> Objective | None:
+    """Return the objective with what chance makes of its loud segments; nothing if that is little.
+
+    Args:
+        objective: Segments and their covariance, of a robot that can touch something.
+        point: The simulator.
+        noise: Standard deviation of each channel's noise, shape ``(C,)``.
+        generator: Of the noise that is drawn.
+    """
+    if not objective.predictor.colliding:
+        return None
+    squares = (objective.unweighted([point])[0] ** 2).mean(-1)
+    loud = np.flatnonzero(squares > _LOUD)
+    if not len(loud):
+        return None
+    larger = _made_by_noise(objective.take(loud), point, noise, generator)
+    if larger.max() < _MATTERS:
+        return None
+    whitening, channels = objective.whitening, len(noise)
+    inverse, drift = whitening.inverse.copy(), whitening.drift.copy()
+    scale = 1.0 / np.sqrt(np.repeat(larger, channels, axis=1))
+    inverse[loud] *= scale[..., None]
+    drift[loud] *= scale
+    return objective.whitened(replace(whitening, inverse=inverse, drift=drift))
+
+
+def _made_by_noise(
+    objective: Objective, point: Point, noise: Array, generator: np.random.Generator
+) -> Array:
+    """Return how much larger than one squared innovations of noise are, 1 at least, ``(S, K)``."""
+    root = start_noise(objective.predictor, objective.segments, noise)
+    size = len(objective.segments)
+    drawn = np.einsum("dsj,jsn->dsn", generator.standard_normal((_DRAWS, size, len(root))), root)
+    moved = objective.raw([point] * _DRAWS, drawn) - objective.raw([point])
+    moved += noise * generator.standard_normal(moved.shape)
+    white = objective.whitening(moved) / objective.whitening.weights[:, None]
+    return excess((white**2).reshape(*moved.shape))
