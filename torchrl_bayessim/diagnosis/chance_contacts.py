@@ -18,13 +18,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .contacts import touches
 from .objective import Objective, Point
 from .whitening import excess, start_noise
 
 Array = NDArray[np.float64]
 _LOUD = 3.0  # mean squared innovation of a segment that is looked at
 _DRAWS = 48
-_MATTERS = 1.5  # times what the covariance says
+_TWICE = 2.0  # what the covariance says
+_PART = 0.3  # of what is left beyond noise
 
 
 def left_to_chance(
@@ -41,29 +43,34 @@ def left_to_chance(
 def trusted_less(
     objective: Objective, point: Point, *, noise: Array, generator: np.random.Generator
 ) -> Objective | None:
-    """Return the objective with what chance makes of its loud segments; nothing if that is little.
+    """Return the objective with what chance makes of its loud segments.
+
+    Nothing if that is less than a third of what is left beyond noise.
 
     Args:
-        objective: Segments and their covariance, of a robot that can touch something.
+        objective: Segments and their covariance, of one simulator.
         point: The simulator.
         noise: Standard deviation of each channel's noise, shape ``(C,)``.
         generator: Of the noise that is drawn.
     """
-    if not objective.predictor.colliding:
-        return None
     squares = (objective.unweighted([point])[0] ** 2).mean(-1)
     loud = np.flatnonzero(squares > _LOUD)
-    if not len(loud):
+    if not len(loud) or not touches(objective.predictor, objective.segments.qpos):
         return None
     larger = _made_by_noise(objective.take(loud), point, noise, generator)
-    if larger.max() < _MATTERS:
+    chance = larger.mean(1) > _TWICE
+    loud, larger = loud[chance], larger[chance]
+    if not len(loud):
         return None
-    whitening, channels = objective.whitening, len(noise)
+    whitening = objective.whitening
     inverse, drift = whitening.inverse.copy(), whitening.drift.copy()
-    scale = 1.0 / np.sqrt(np.repeat(larger, channels, axis=1))
+    scale = 1.0 / np.sqrt(np.repeat(larger, len(noise), axis=1))
     inverse[loud] *= scale[..., None]
     drift[loud] *= scale
-    return objective.whitened(replace(whitening, inverse=inverse, drift=drift))
+    less = objective.whitened(replace(whitening, inverse=inverse, drift=drift))
+    by_chance = squares[loud] - (less.take(loud).unweighted([point])[0] ** 2).mean(-1)
+    left = np.maximum(squares - 1.0, 0.0).sum()
+    return less if by_chance.sum() > _PART * left else None
 
 
 def _made_by_noise(

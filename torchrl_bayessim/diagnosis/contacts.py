@@ -21,7 +21,7 @@ sensor: it is believed where most segments are likelier with its starts.
 
 from __future__ import annotations
 
-__all__ = ["likelier", "one_sided", "resting", "settled"]
+__all__ = ["likelier", "one_sided", "resting", "settled", "touches"]
 
 import copy
 from collections.abc import Sequence
@@ -53,6 +53,22 @@ def one_sided(predictor: Predictor, logs: Sequence[Log], *, theta: Array, noise:
     if not predictor.colliding:
         return False
     return whitening(predictor, _pieces(logs, _FEW), theta, noise).curvature > _BENT
+
+
+def touches(predictor: Predictor, qpos: Array) -> bool:
+    """Return whether anything touches anything in one of the positions ``(*, nq)``."""
+    if not predictor.colliding:
+        return False
+    model = predictor.system.task.model
+    data = mujoco.MjData(model)
+    for one in qpos.reshape(-1, model.nq):
+        data.qpos[:] = one
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        if data.ncon:
+            return True
+    return False
 
 
 def likelier(

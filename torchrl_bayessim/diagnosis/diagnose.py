@@ -152,9 +152,10 @@ def _beside_noise(
     """
     alarms = prepared.alarms
     prepared, selection = search(prepared)
-    less = with_less_trust(prepared, selection.best.fit.point, generator=generator)
-    if less is not None:
-        prepared, selection = search(less, known=selection)
+    if selection.best.mean_square >= _NEARLY:
+        less = with_less_trust(prepared, selection.best.fit.point, generator=generator)
+        if less is not None:
+            prepared, selection = search(less, known=selection)
     if selection.best.mean_square < _NEARLY:
         quieter = with_less_noise(prepared, selection.best.fit.point, generator=generator)
         if quieter is not None:
