@@ -23,6 +23,7 @@ GENERATOR = {
         "causes_foreign",
         "causes_sensing",
         *("causes_chance", "plant_bullet"),
+        "coordinates",
         "folders",
         "renaming",
     ),

@@ -18,6 +18,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from .coordinates import coordinates, displaced, positions
+
 Array = NDArray[np.float64]
 Policy = Callable[[int, Array], Array]  # control step and measurements to commands
 
@@ -112,7 +114,7 @@ class Plant:
 
     @property
     def q(self) -> Array:
-        """Positions; joints are hinges and slides."""
+        """Positions, of hinges and slides first, each where its degree of freedom is."""
         return self.data.qpos
 
     @property
@@ -121,19 +123,18 @@ class Plant:
         return self.data.qvel
 
     def run(self, q: Array, v: Array, policy: Policy, *, steps: int) -> Motion:
-        """Return a trajectory from a state.
+        """Return a trajectory from a state in tangent coordinates.
 
         Raises:
             FloatingPointError: The simulation diverged.
         """
-        self._begin(q, v)
+        self.begin(np.concatenate([q, v]))
         clean, measured = [], []
         for k in range(steps):
             clean.append(self._read())
-            measured.append(clean[-1] + self.noise * self.rng.standard_normal(len(self.noise)))
+            measured.append(self._noisy(clean[-1]))
             self.commands.append(np.asarray(policy(k, measured[-1]), dtype=np.float64))
-            for _ in range(self.substeps):
-                self._step()
+            self.go()
         rows, nv = np.array(clean), self.model.nv
         if not np.isfinite(rows).all() or np.abs(rows).max() > 1e3:
             raise FloatingPointError("the simulation diverged")
@@ -156,17 +157,15 @@ class Plant:
         Returns:
             Shape ``(T, 2 nv)``.
         """
-        nv = self.model.nv
-        self._begin(states[0, :nv], states[0, nv:])
-        rows = []
+        self.begin(states[0])
+        nv, rows = self.model.nv, []
         for k, command in enumerate(commands):
             rows.append(self._aside() if k in at else self._read())
             if k in at:
                 self._place(states[k, :nv], states[k, nv:])
                 self._read()  # what sensors remember of the row is the state that follows
             self.commands.append(command)
-            for _ in range(self.substeps):
-                self._step()
+            self.go()
         return np.array(rows)
 
     def _aside(self) -> Array:
@@ -180,12 +179,17 @@ class Plant:
             rows.pop()
         return row
 
-    def _begin(self, q: Array, v: Array) -> None:
+    def begin(self, state: Array) -> None:
         """Start a trajectory: nothing was commanded, and no cause remembers anything."""
         self.commands, self.states, self.acts, self.sensed = [], [], [], []
         for cause in self.causes:
             cause.memory.clear()
-        self._reset(q, v)
+        self._reset(*np.split(state, 2))
+
+    def go(self) -> None:
+        """Go on by a control step, with the last command."""
+        for _ in range(self.substeps):
+            self._step()
 
     def _reset(self, q: Array, v: Array) -> None:
         """Put the robot into a state, at time zero."""
@@ -194,7 +198,7 @@ class Plant:
 
     def _place(self, q: Array, v: Array) -> None:
         """Put the robot into a state, now."""
-        self.data.qpos[:], self.data.qvel[:] = q, v
+        self.data.qpos[:], self.data.qvel[:] = positions(self.model, q), v
         mujoco.mj_forward(self.model, self.data)
 
     def _advance(self, u: Array, force: Array) -> None:
@@ -202,8 +206,12 @@ class Plant:
         self.data.ctrl[:], self.data.qfrc_applied[:] = u, force
         mujoco.mj_step(self.model, self.data)
 
+    def _noisy(self, y: Array) -> Array:
+        nv, noise = self.model.nv, self.noise * self.rng.standard_normal(len(self.noise))
+        return np.concatenate([displaced(self.model, y[:nv], noise[:nv]), y[nv:] + noise[nv:]])
+
     def _read(self) -> Array:
-        y = np.concatenate([self.q, self.v])
+        y = np.concatenate([coordinates(self.model, self.q), self.v])
         self.states.append(y)
         self.acts.append(np.zeros(len(self.causes)))
         self.sensed.append(np.zeros((len(self.causes), len(y))))

@@ -36,6 +36,7 @@ from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.system import System
 
+from .coordinates import positions
 from .scoring import NAMING
 
 Array = NDArray[np.float64]
@@ -151,14 +152,15 @@ def _logs(unseen: Path, like: Log, system: System) -> list[Log]:
     made = []
     with np.load(unseen) as arrays:
         for i in range(sum(name.startswith("clean") for name in arrays.files)):
-            clean, ctrl = (torch.from_numpy(arrays[f"{kind}{i}"]) for kind in ("clean", "ctrl"))
-            nv = clean.shape[1] // 2
+            clean, ctrl = arrays[f"clean{i}"], torch.from_numpy(arrays[f"ctrl{i}"])
+            q, v = np.split(clean, 2, axis=1)
+            qpos = np.array([positions(system.task.model, row) for row in q])
             made.append(
                 Log(
                     name=f"unseen{i}",
                     time=system.control_dt * torch.arange(len(clean), dtype=torch.float64),
-                    qpos=clean[:, :nv],
-                    qvel=clean[:, nv:],
+                    qpos=torch.from_numpy(qpos),
+                    qvel=torch.from_numpy(v),
                     ctrl=ctrl,
                     velocity_gain=like.velocity_gain,
                     measured=like.measured,
