@@ -16,6 +16,8 @@ robot in another engine (MuJoCo with another integrator, cone and solver; T6B: t
 which needs the extra ``pybullet``); controls: parameters at
 the edge of the prior, twice the noise of the data sheet, actions shuffled between trajectories,
 and the same case twice, the second time with every name drawn anew.
+``robots=fetch_push`` is Gymnasium-Robotics' arm that pushes an object, with causes in its actions,
+its encoders, the object and contacts, and none in joints; there is no T4 or T6B of it.
 ``baselines=true`` asks other methods too (see ``baselines/methods.py``), on the same folders.
 Causes below ``threshold`` (see ``withheld/detectability.py``) cannot be seen by anyone, and are
 left out of the scores of T1 to T6; ``by_detectability`` has them. Of a pair, each is to be seen,

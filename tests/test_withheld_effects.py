@@ -23,7 +23,7 @@ GENERATOR = {
         "causes_foreign",
         "causes_sensing",
         *("causes_chance", "plant_bullet"),
-        "coordinates",
+        *("coordinates", "fetch_push", "plant_fetch", "pushing"),
         "folders",
         "renaming",
     ),
@@ -61,6 +61,7 @@ def test_the_generator_imports_nothing_of_the_package():
             else:
                 assert module.split(".")[0] in {
                     *("__future__", "collections", "copy", "dataclasses", "hashlib", "io", "math"),
+                    *("functools", "gymnasium_robotics"),
                     *(
                         "pathlib",
                         "re",

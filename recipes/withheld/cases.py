@@ -20,9 +20,12 @@ from .causes_sensing import SENSING
 from .classes import without_class_of
 from .detectability import beside, detectability
 from .excitation import KINDS, open_loop, proportional
+from .fetch_push import ARM, OBJECT
 from .laws import Made, Site
 from .plant import Cause, Motion, Plant, Policy, Truth
 from .plant_bullet import BulletPlant
+from .plant_fetch import FetchPlant, dragged
+from .pushing import pushes
 from .robots import ROBOTS, Robot, nominal_model, write_entry
 
 Array = NDArray[np.float64]
@@ -113,7 +116,8 @@ def _make(plan: Plan, rng: np.random.Generator) -> Case:
     made = [_cause(name, plan.form, model=nominal, robot=robot, rng=rng) for name in order]
     nv = nominal.nv
     noise = np.repeat([_log(rng, 1e-3, 3e-3), _log(rng, 1e-2, 3e-2)], nv)
-    kind = BulletPlant if plan.engine == "bullet" else Plant
+    noise *= np.tile(np.broadcast_to(robot.noise, nv), 2)
+    kind = BulletPlant if plan.engine == "bullet" else FetchPlant if robot.commands else Plant
 
     def plant_with(causes: list[Cause], rng: np.random.Generator) -> Plant:
         return kind(_true_model(nominal, robot, plan.engine), robot.control_dt, causes, noise, rng)
@@ -121,6 +125,8 @@ def _make(plan: Plan, rng: np.random.Generator) -> Case:
     plant = plant_with([c for c, _ in made], rng)
     loops = str(rng.choice(["open", "open", "closed", "mixed"]))
     velocities = bool(rng.random() < 0.75) or bool(_OF_VELOCITIES & set(plan.causes))
+    # differences of positions are too coarse for speeds in the dampers that hold a dragged arm
+    velocities |= bool(robot.commands)
     told = noise if rng.random() < 0.5 else None
     if plan.control == "noise":
         told, plant.noise = noise, 2.0 * noise
@@ -141,17 +147,26 @@ def _make(plan: Plan, rng: np.random.Generator) -> Case:
         detectability(
             nominal, some, substeps=round(robot.control_dt / nominal.opt.timestep),
             noise=real, measured=measured, parameters=list(priors), known=shown,
+            simulate=dragged if robot.commands else None,
         )
         for some, shown in seen
     )  # fmt: skip
     if plan.control == "shuffled":
         motions = [replace(m, ctrl=motions[i - 1].ctrl) for i, m in enumerate(motions)]
-    withheld = tuple(without_class_of(plan.causes[0])) if plan.tier == "T3" else None
     return Case(
         plan=plan, truths=tuple(t for _, t in made), theta=theta, priors=priors,
         motions=tuple(motions), unseen=tuple(unseen), noise=told, real_noise=real,
-        velocities=velocities, effects=withheld, detectability=visible, excitation=loops,
+        velocities=velocities, effects=_considered(plan, robot), detectability=visible,
+        excitation=loops,
     )  # fmt: skip
+
+
+def _considered(plan: Plan, robot: Robot) -> tuple[str, ...] | None:
+    """Return the names that the diagnosis may consider; nothing for all."""
+    if plan.tier != "T3":
+        return robot.effects
+    left = without_class_of(plan.causes[0])
+    return tuple(name for name in left if robot.effects is None or name in robot.effects)
 
 
 def _place_in_chain(name: str) -> int:
@@ -168,9 +183,9 @@ def _priors(
 ) -> dict[str, tuple[float, float]]:
     """Return bounds of masses, dampings or both; never of what a cause cannot be told from."""
     kinds = []
-    if not _LIKE_MASSES & set(causes):
+    if robot.masses and not _LIKE_MASSES & set(causes):
         kinds.append(robot.masses)
-    if not _LIKE_DAMPINGS & set(causes):
+    if robot.dampings and not _LIKE_DAMPINGS & set(causes):
         kinds.append(robot.dampings)
     if len(kinds) == 2 and rng.random() < 0.5:
         kinds = [kinds[int(rng.integers(2))]]
@@ -202,6 +217,8 @@ def _cause(
     name: str, form: str, *, model: mujoco.MjModel, robot: Robot, rng: np.random.Generator
 ) -> Made:
     """Return a cause at a random place."""
+    if robot.commands:
+        return CAUSES[name](_site_about_a_hand(name, form, model=model, robot=robot, rng=rng))
     actuator, dof = sites(model)[int(rng.integers(model.nu))]
     torque = float(model.actuator_ctrlrange[actuator, 1] * model.actuator_gear[actuator, 0])
     if robot.name == "cart_pole" and name in BODY and rng.random() < 0.5:
@@ -215,14 +232,32 @@ def _cause(
     return CAUSES[name](site)
 
 
+def _site_about_a_hand(
+    name: str, form: str, *, model: mujoco.MjModel, robot: Robot, rng: np.random.Generator
+) -> Site:
+    """Return a place for a cause: one of the commands, the object, or an encoder of the arm."""
+    actuator, dof = int(rng.integers(3)), int(rng.choice(ARM))  # the fourth command does nothing
+    if name in BODY:
+        dof = OBJECT
+    joint = model.joint(int(model.dof_jntid[dof])).name
+    if name not in {*BODY, *SENSING, "sensor_dropout"}:
+        joint = robot.commands[actuator]
+    return Site(
+        model=model, actuator=actuator, dof=dof, joint=joint, torque=1.0, limit=1.0,
+        control_dt=robot.control_dt, form=form, rng=rng,
+    )  # fmt: skip
+
+
 def _motions(
     plant: Plant, robot: Robot, loops: str, *, count: int, steps: int, rng: np.random.Generator
 ) -> list[Motion]:
     model, motions = plant.model, []
+    loop = [loops == "closed" or (loops == "mixed" and i % 2 == 1) for i in range(count)]
+    if robot.commands:
+        return pushes(plant, nominal_model(robot), loop, steps=steps, rng=rng)
     limit = model.actuator_ctrlrange[:, 1] * robot.amplitude
     dofs = np.array([dof for _, dof in sites(model)])
-    for i in range(count):
-        closed = loops == "closed" or (loops == "mixed" and i % 2 == 1)
+    for i, closed in enumerate(loop):
         kind = KINDS[i % len(KINDS)]
         waves = open_loop(kind, steps=steps, dt=robot.control_dt, limit=limit, rng=rng)
         policy: Policy = lambda k, _, waves=waves: waves[k]

@@ -32,6 +32,8 @@ from .plant import Motion, Plant
 from .robots import entry_value, write_entry
 
 Array = NDArray[np.float64]
+# of a model, states (segments, 2 nv), commands (segments, horizon, nu) and time steps per command
+Simulate = Callable[[mujoco.MjModel, Array, Array, int], Array]
 _DRAWS = 16  # of the noise
 _HORIZON = 20  # H
 _FIRST = 6  # row that is predicted from: before it causes have nothing to remember
@@ -47,6 +49,7 @@ def detectability(
     measured: Array,
     parameters: Sequence[str],
     known: Sequence[Array] | None = None,
+    simulate: Simulate | None = None,
 ) -> float:
     """Return ``lambda``.
 
@@ -58,8 +61,10 @@ def detectability(
         measured: Which of them the diagnosis sees, boolean.
         parameters: Entries of the model that the diagnosis may refit.
         known: What another cause alone would show of each motion, in pieces, as `beside` gives.
+        simulate: Where commands are not the actuators': what follows from states and commands.
     """
-    horizon = _HORIZON
+    horizon, simulate = _HORIZON, simulate or _rollout
+    measured = measured & (noise > 0)  # what stands still without noise tells nothing
     start, commands, after, shown = [], [], [], []
     for i, motion in enumerate(motions):
         for k in _starts(len(motion.clean)):
@@ -73,12 +78,12 @@ def detectability(
 
     def predict(first: Array) -> Array:
         """Return the measured channels, ``(segments, horizon, channels)``."""
-        return _rollout(model, first, u, substeps)[..., measured]
+        return simulate(model, first, u, substeps)[..., measured]
 
     base = predict(x)
     first_noise = np.where(measured, noise, _UNKNOWN * np.resize(noise[: width // 2], width))
     columns = []
-    for i in range(width):
+    for i in np.flatnonzero(first_noise):
         step = first_noise[i] * np.eye(width)[i]
         columns.append((predict(x + step) - predict(x - step)) / 2)
     spread = np.stack([c.reshape(len(x), -1) for c in columns], -1)

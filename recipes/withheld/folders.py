@@ -10,7 +10,7 @@ __all__ = ["digest", "handed_over", "label", "unseen"]
 
 import hashlib
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,23 +20,26 @@ import numpy as np
 import yaml
 
 from .cases import Case
+from .coordinates import positions
 from .plant import Motion
 from .robots import ROBOTS, Robot, nominal_model
+
+_POSE = "x", "y", "z", "qw", "qx", "qy", "qz"  # of a free joint
+_TWIST = "vx", "vy", "vz", "wx", "wy", "wz"
 
 
 def handed_over(case: Case) -> dict[str, str]:
     """Return the files that the diagnosis may see, by name."""
     robot = ROBOTS[case.plan.robot]
     model = nominal_model(robot)
-    joints = [model.joint(j).name for j in range(model.njnt)]
     actuators = [model.actuator(a).name or f"actuator{a}" for a in range(model.nu)]
     columns: dict[str, Any] = {
         "time": "t",
-        "qpos": {joint: f"q_{joint}" for joint in joints},
-        "ctrl": {actuator: f"u_{actuator}" for actuator in actuators},
+        "qpos": _columns(model, "q", _POSE),
+        "ctrl": {command: f"u_{command}" for command in robot.commands or actuators},
     }
     if case.velocities:
-        columns["qvel"] = {joint: f"v_{joint}" for joint in joints}
+        columns["qvel"] = _columns(model, "v", _TWIST)
     system: dict[str, Any] = {
         "simulator": robot.simulator,
         "control_dt": robot.control_dt,
@@ -45,12 +48,36 @@ def handed_over(case: Case) -> dict[str, str]:
         "effects": "all" if case.effects is None else list(case.effects),
     }
     if case.noise is not None:
-        names = [*columns["qpos"].values(), *columns.get("qvel", {}).values()]
-        system["noise"] = dict(zip(names, map(float, case.noise), strict=False))
+        system["noise"] = dict(zip(_channels(columns), map(float, case.noise), strict=False))
     files = {"system.yaml": yaml.safe_dump(system, sort_keys=False)}
     if robot.simulator == "robot.xml":
         files["robot.xml"] = robot.xml
     return files | _logs(case.motions, columns=columns, dt=robot.control_dt, model=model)
+
+
+def _columns(
+    model: mujoco.MjModel, kind: str, of_free: Sequence[str]
+) -> dict[str, str | list[str]]:
+    """Return the columns of every joint: one, or those of a free joint."""
+    free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+    names = [model.joint(j).name for j in range(model.njnt)]
+    return {
+        name: [f"{kind}_{name}_{axis}" for axis in of_free] if free[j] else f"{kind}_{name}"
+        for j, name in enumerate(names)
+    }
+
+
+def _flat(columns: Mapping[str, str | list[str]]) -> list[str]:
+    return [name for c in columns.values() for name in ([c] if isinstance(c, str) else c)]
+
+
+def _channels(columns: Mapping[str, Any]) -> list[str]:
+    """Return what the measured tangent coordinates are called: their columns, but for rotations."""
+    channels: list[str] = []
+    for joint, names in columns["qpos"].items():
+        turns = [f"{joint} rotation {axis}" for axis in "xyz"]
+        channels += [names] if isinstance(names, str) else [*names[:3], *turns]
+    return channels + _flat(columns.get("qvel", {}))
 
 
 def unseen(case: Case) -> bytes:
@@ -70,13 +97,14 @@ def unseen(case: Case) -> bytes:
 def _logs(
     motions: Sequence[Motion], *, columns: dict, dt: float, model: mujoco.MjModel
 ) -> dict[str, str]:
-    header = ["t", *columns["qpos"].values(), *columns.get("qvel", {}).values()]
+    header = ["t", *_flat(columns["qpos"]), *_flat(columns.get("qvel", {}))]
     header += columns["ctrl"].values()
     files = {}
     for i, motion in enumerate(motions):
         time = dt * np.arange(len(motion.ctrl))[:, None]
-        width = 2 * model.nv if "qvel" in columns else model.nv
-        rows = np.concatenate([time, motion.measured[:, :width], motion.ctrl], 1)
+        y, v = np.split(motion.measured, 2, axis=1)
+        q = np.array([positions(model, row) for row in y])
+        rows = np.concatenate([time, q, *([v] if "qvel" in columns else []), motion.ctrl], 1)
         text = ",".join(header) + "\n"
         text += "\n".join(",".join(f"{x:.9g}" for x in row) for row in rows) + "\n"
         files[f"run{i:02d}.csv"] = text
@@ -103,9 +131,11 @@ def label(case: Case) -> dict[str, Any]:
 
 
 def _places(robot: Robot, joint: str) -> list[str]:
-    """Return what a joint, its actuators and its body are called."""
+    """Return what a joint, its actuators and its body are called; a command, as it is."""
     if joint == "all":
         return []
+    if joint in robot.commands:
+        return [joint]
     model = nominal_model(robot)
     number = model.joint(joint).id
     driven = [a for a in range(model.nu) if model.actuator_trnid[a, 0] == number]

@@ -19,7 +19,16 @@ from .classes import class_of
 CONTROLS = ("parameters", "noise", "shuffled", "renamed")
 _ENGINES = {"T6": "other", "T6B": "bullet"}
 _OF_MUJOCO = {"load_dependent_friction"}  # which asks MuJoCo for the load
-_OF_GYMNASIUM = {"hopper", "half_cheetah"}
+_OF_GYMNASIUM = {"hopper", "half_cheetah", "fetch_push"}
+# Commands that are no motor's, an object and its contacts, and encoders; nothing in joints, of
+# which an arm that is dragged by its hand shows nothing. The object's centre of mass stays: MuJoCo
+# takes it to be the body's origin for good
+_OF_A_DRAGGED_HAND = {
+    *("action_delay", "action_lag", "dead_band", "saturation", "action_gain", "action_bias"),
+    *("packet_drop", "action_jitter", "gravity_tilt", "payload", "sensor_dropout"),
+    *SENSING,
+    *CONTACT,
+}
 _OTHER_ONLY = {"backlash", "series_elasticity"}  # of two masses, unlike the catalogue's
 _SAME_ONLY = {"armature", "com_shift"}
 _TOO_FAST = {"half_cheetah": {"backlash"}}  # two masses at 40 Hz, on its grid of 10 ms
@@ -33,6 +42,8 @@ def applicable(robot: str, form: str = "same") -> list[str]:
     left = _OTHER_ONLY if form == "same" else _SAME_ONLY
     if robot == "cart_pole":
         left = left | _OTHER_ONLY | {"armature"}  # its motor has no rotor
+    if robot == "fetch_push":
+        left = left | set(names) - _OF_A_DRAGGED_HAND
     left = left | _TOO_FAST.get(robot, set())
     return [name for name in names if name not in left]
 
@@ -70,14 +81,15 @@ def _tier(tier: str, robot: str, count: int, rng: np.random.Generator) -> list[P
         half = [()] * (count - count // 2) + [(name,) for name in _deal(deck, count // 2, rng)]
         able = tier == "T6" or robot == "arm"
         return [Plan(tier, robot, causes, engine=_ENGINES[tier]) for causes in half if able]
-    deck = {"T1": same, "T2": other, "T3": same, "T4": list(FOREIGN)}[tier]
+    foreign = [] if robot == "fetch_push" else list(FOREIGN)  # those are in joints
+    deck = {"T1": same, "T2": other, "T3": same, "T4": foreign}[tier]
     form = "other" if tier == "T2" else "same"
     return [Plan(tier, robot, (name,), form) for name in _deal(deck, count, rng)]
 
 
 def _deal(deck: Sequence[str], count: int, rng: np.random.Generator) -> list[str]:
     dealt: list[str] = []
-    while len(dealt) < count:
+    while deck and len(dealt) < count:
         dealt += [deck[i] for i in rng.permutation(len(deck))]
     return dealt[:count]
 

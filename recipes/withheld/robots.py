@@ -17,6 +17,8 @@ from pathlib import Path
 import gymnasium
 import mujoco
 
+from .fetch_push import COMMANDS, EFFECTS, NOISE, SIMULATOR, fetch_push_model
+
 ARM = """<mujoco model="arm">
   <option timestep="0.0025" integrator="RK4"/>
   <default><geom contype="0" conaffinity="0"/></default>
@@ -73,7 +75,7 @@ class Robot:
     Attributes:
         name: Its name.
         simulator: As ``system.yaml`` names it.
-        xml: The model's text, or the file's name in Gymnasium.
+        xml: The model's text, or the file's name in Gymnasium; of a dragged hand nothing.
         control_dt: Seconds between actions.
         masses: Prior bounds of masses, kg.
         dampings: Prior bounds of damping, N m s/rad or N s/m.
@@ -82,6 +84,9 @@ class Robot:
         spread: Of initial positions, rad or m.
         refinement: Time steps of the generator per time step of the model.
         steps: Control steps of a trajectory, least and most.
+        commands: Names of commands that drag a hand; of none the actuators are commanded.
+        noise: Of each tangent coordinate, times that which is drawn; one for all, or ``nv``.
+        effects: Names that the diagnosis may consider; nothing for all.
     """
 
     name: str
@@ -95,6 +100,9 @@ class Robot:
     spread: float
     refinement: int = 4
     steps: tuple[int, int] = (150, 250)
+    commands: tuple[str, ...] = ()
+    noise: tuple[float, ...] = (1.0,)
+    effects: tuple[str, ...] | None = None
 
 
 ROBOTS = {
@@ -127,12 +135,20 @@ ROBOTS = {
             {"body_mass[torso]": (4.5, 9.0)}, {"dof_damping[bthigh]": (3.0, 10.0)},
             amplitude=0.5, reach=0.3, spread=0.05, refinement=1, steps=(60, 80),
         ),
+        Robot(
+            "fetch_push", SIMULATOR, "", 0.04,
+            {"body_mass[object0]": (1.2, 3.2)}, {},
+            amplitude=1.0, reach=0.0, spread=0.0, refinement=1, steps=(45, 60),
+            commands=COMMANDS, noise=NOISE, effects=EFFECTS,
+        ),
     )
 }  # fmt: skip
 
 
 def nominal_model(robot: Robot) -> mujoco.MjModel:
     """Return the model that the diagnosis is given, in its nominal physics."""
+    if robot.commands:
+        return fetch_push_model()
     if robot.xml.endswith(".xml"):
         folder = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
         return mujoco.MjModel.from_xml_path(str(folder / robot.xml))
