@@ -17,7 +17,8 @@ which needs the extra ``pybullet``); controls: parameters at
 the edge of the prior, twice the noise of the data sheet, actions shuffled between trajectories,
 and the same case twice, the second time with every name drawn anew.
 ``robots=fetch_push`` is Gymnasium-Robotics' arm that pushes an object, with causes in its actions,
-its encoders, the object and contacts, and none in joints; there is no T4 or T6B of it.
+its encoders, the object and contacts, and none in joints; there is no T4 or T6B of it. It is drawn
+where it is asked for only, since a diagnosis of it takes minutes.
 ``baselines=true`` asks other methods too (see ``baselines/methods.py``), on the same folders.
 Causes below ``threshold`` (see ``withheld/detectability.py``) cannot be seen by anyone, and are
 left out of the scores of T1 to T6; ``by_detectability`` has them. Of a pair, each is to be seen,

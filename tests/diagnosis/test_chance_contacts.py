@@ -1,14 +1,22 @@
 """Where contacts are met by chance, noise makes what a covariance of another simulator denies."""
 
+import importlib
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
 from torchrl_bayessim.diagnosis.chance_contacts import trusted_less
-from torchrl_bayessim.diagnosis.objective import Objective, Point
+from torchrl_bayessim.diagnosis.modes import Mode
+from torchrl_bayessim.diagnosis.objective import Objective, Point, units_of
 from torchrl_bayessim.diagnosis.prediction import Predictor
+from torchrl_bayessim.diagnosis.preparation import Prepared
+from torchrl_bayessim.diagnosis.prepared_anew import with_less_trust
+from torchrl_bayessim.diagnosis.refit import refit
 from torchrl_bayessim.diagnosis.segments import cut_for_fits
 from torchrl_bayessim.diagnosis.whitening import whitening
+from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.envs.tasks.catalogue import known_task
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.logs.log import Log
@@ -16,6 +24,8 @@ from torchrl_bayessim.logs.system import System
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
 from torchrl_bayessim.replay import Replay
 
+# by its path, since the package has a function of that name
+diagnose = importlib.import_module("torchrl_bayessim.diagnosis.diagnose")
 NOISE = np.repeat([0.002, 0.02], 9)
 PHYSICS = MujocoPhysics("body_mass[torso]", "dof_damping[bfoot]")
 TRUE, ELSEWHERE = (6.0, 3.0), (6.4, 3.3)
@@ -100,6 +110,39 @@ def test_a_robot_that_touches_nothing_is_trusted(monkeypatch):
     generator = np.random.default_rng(1)
     assert trusted_less(objective, point, noise=NOISE, generator=generator) is None
     assert generator.bit_generator.state == np.random.default_rng(1).bit_generator.state
+
+
+def test_beside_what_was_found_segments_are_trusted_less_and_parameters_fitted_again():
+    objective, point = seen_from_elsewhere(running(3))
+    nominal = refit(objective, [point], iterations=0)[0]
+    sets, mode = {"train": objective}, Mode()
+    prepared = Prepared(objective.predictor, sets, {}, NOISE, "", 10, nominal, (), mode)
+    draw = lambda: np.random.default_rng(1)
+    assert with_less_trust(prepared, point, generator=draw()) is None  # nothing was found
+    unit = units_of([effect("viscous_friction")], objective.predictor.system.robot)[0]
+    found = Point(point.z, {unit: 1e-6})
+    less = with_less_trust(prepared, found, generator=draw())
+    assert squares(less.sets["train"], found).mean() < 1.4
+    again = refit(less.sets["train"], [less.nominal.point], iterations=0)[0]
+    np.testing.assert_allclose(less.nominal.innovations, again.innovations, atol=1e-6)
+
+
+@pytest.mark.parametrize(("left", "searched"), [(3.0, 2), (1.5, 1)])
+def test_only_where_much_is_left_a_search_goes_on(monkeypatch, left, searched):
+    model = SimpleNamespace(mean_square=left, fit=SimpleNamespace(point=None))
+    selection, calls = SimpleNamespace(best=model), []
+
+    def search(prepared, known=None):
+        calls.append((prepared, known))
+        return prepared, selection
+
+    started = SimpleNamespace(alarms=("one",))
+    monkeypatch.setattr(diagnose, "with_less_trust", lambda *_, **__: "less")
+    monkeypatch.setattr(diagnose, "with_less_noise", lambda *_, **__: None)
+    alarms, prepared, _ = diagnose._beside_noise(search, started, np.random.default_rng(0))
+    assert alarms == ("one",)
+    assert calls == [(started, None), ("less", selection)][:searched]
+    assert prepared == calls[-1][0]
 
 
 @pytest.fixture(autouse=True)
