@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from torchrl.envs import GymEnv
 
 from torchrl_bayessim.envs.additions import rollout_with, steps_with
+from torchrl_bayessim.envs.drive import Drive
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.envs.stepper import Stepper
 from torchrl_bayessim.transforms.simulators import add_every_time_step
@@ -106,3 +107,20 @@ def test_a_force_on_a_dragged_arm_is_that_of_the_single_simulator():
         two = single.step(TensorDict({"action": action}, []))["next", "observation"]
     assert (one - first[0]).abs().max() > 1e-3
     torch.testing.assert_close(one.double(), two.double(), atol=1e-6, rtol=0.0)
+
+
+def test_an_addition_sees_the_control_and_not_what_it_is_relative_to():
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint name='x' type='slide'/><geom size='.1'/></body>"
+        "</worldbody><actuator><position joint='x' kp='10'/></actuator></mujoco>"
+    )
+    stepper = Stepper(model, 1, drive=Drive(relative=(0,)), threads=1)
+    stepper["qpos"][:] = 1.0
+    seen = []
+
+    def look(now):
+        seen.append(float(now.ctrl))
+        return {}
+
+    rollout_with(stepper, [look], np.full((1, 1, 1), 0.1), substeps=3)
+    assert seen == [pytest.approx(1.1)] * 3

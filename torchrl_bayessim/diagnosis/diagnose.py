@@ -205,8 +205,8 @@ def _check_actuators(system: System) -> None:
     model = system.task.model
     if model.na:
         moved = [
-            name
-            for name, kind in zip(system.robot.actuators, model.actuator_dyntype, strict=True)
+            model.actuator(i).name or f"actuator{i}"
+            for i, kind in enumerate(model.actuator_dyntype)
             if kind
         ]
         raise ValueError(

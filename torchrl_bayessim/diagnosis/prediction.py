@@ -264,7 +264,7 @@ class Predictor:
         convert = self.system.task.command
         if convert is None:
             return actions
-        return np.ascontiguousarray(convert(torch.from_numpy(actions)).numpy())
+        return np.ascontiguousarray(convert(torch.from_numpy(actions)).detach().double().numpy())
 
     def _push(
         self,
@@ -288,8 +288,8 @@ class Predictor:
         parts = self.substeps if self.exact else fewest_parts(self.substeps, self.system.task.dt)
         held = self.system.task.dt / parts
         for t in range(segments.horizon):
-            ctrl = torch.from_numpy(commands[:, t, : stepper.models.model.nu])
             kept = HeldCommand(stepper, rows)
+            ctrl = torch.from_numpy(kept.controls(commands[:, t]))
             for left in reversed(range(parts)):
                 state = {n: torch.from_numpy(stepper[n][rows]) for n in ("qpos", "qvel", "time")}
                 added, memories = self._forcing(
@@ -322,7 +322,7 @@ class Predictor:
         stepper, drive = self._stepper, self.system.task.drive
         starts = stepper.state.copy()
         if not drive.pinned:
-            back = -float(stepper.models.model.opt.timestep) * stepper["qvel"]
+            back = -float(self.system.task.model.opt.timestep) * stepper["qvel"]
             stepper["qpos"][:] = self.tangent.displace(stepper["qpos"], back)
         stepper.begin()
         starts[:, stepper.components["weld_pose"]] = stepper["weld_pose"]

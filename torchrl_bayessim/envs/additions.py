@@ -41,7 +41,7 @@ def rollout_with(
     Returns:
         The outputs after each command, shape ``(N, T, M)``; NaN after a divergence.
     """
-    models, count, nu = stepper.models, stepper.models.model.nv, stepper.models.model.nu
+    models, count, nu = stepper.models, stepper.models.model.nv, len(stepper.relative)
     base = {f: [models.read(f, (d,)) for d in range(count)] for f in _FIELDS}
     applied = stepper["qfrc_applied"].copy()
     rows = np.arange(stepper.num_envs)
@@ -49,10 +49,11 @@ def rollout_with(
     after = np.empty((stepper.num_envs, 1, stepper.output_size))
     for t in range(commands.shape[1]):
         held = HeldCommand(stepper, np.arange(stepper.num_envs))
+        control = torch.from_numpy(held.controls(commands[:, t]))
         for left in reversed(range(substeps)):
             names = "qpos", "qvel", "time"
             state = {name: torch.from_numpy(stepper[name]) for name in names}
-            added = _total(additions, ctrl=torch.from_numpy(commands[:, t, :nu]), **state)
+            added = _total(additions, ctrl=control, **state)
             stepper["qfrc_applied"][:] = applied + added.get("qfrc_applied", 0.0)
             for field in _FIELDS:
                 for d, value in enumerate(base[field] if field in added else ()):

@@ -32,6 +32,12 @@ class HeldCommand:
         self._begun = stepper["qpos"][np.ix_(rows, self._joints)]
         self._pose = stepper["weld_pose"][rows] if stepper.welded else None
 
+    def controls(self, commands: Array) -> Array:
+        """Return the controls that commands ``(R, C)`` of the beginning make, ``(R, nu)``."""
+        controls = commands[:, : len(self._stepper.relative)].copy()
+        controls[:, self._moved] += self._begun
+        return controls
+
     def again(self, commands: Array) -> Array:
         """Return what to command in the coming part, so that ``(R, C)`` of the beginning go on."""
         if self._pose is not None:
