@@ -431,3 +431,15 @@ def test_the_dead_band_of_a_motor_is_around_no_command():
     band = ApplyEffect("dead_band", 0.05)
     TransformedEnv(GymEnv(NAME), band)
     assert isinstance(band.effect, ActionEffect)
+
+
+def test_motors_of_a_task_that_scales_its_actions_stay_motors():
+    one = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint name='x' type='slide'/><geom size='.1'/></body>"
+        "</worldbody><actuator><motor name='m' joint='x' ctrlrange='-2 2'/></actuator></mujoco>"
+    )
+    bounds = -np.ones(1), np.ones(1)
+    task = Task(model=one, frame_skip=1, command=lambda action: 2 * action, bounds=bounds)
+    limit = ApplyEffect("torque_speed_limit", 0.5)
+    TransformedEnv(BatchedMujocoEnv(task, 1, threads=1), limit)
+    assert limit.targets == ("m",)

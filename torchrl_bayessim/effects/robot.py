@@ -118,8 +118,9 @@ def robot_of(task: Task) -> Robot:
     joints = tuple(model.joint(j).name or f"joint{j}" for j in scalar)
     qpos = tuple(int(model.jnt_qposadr[j]) for j in scalar)
     dofs = tuple(int(model.jnt_dofadr[j]) for j in scalar)
-    # what actions are converted to is not the force of one joint
-    moved = [-1 if task.converts else _moved_joint(model, i) for i in range(len(task.action_names))]
+    # an action that is not an actuator's is not the force of one joint
+    known = task.of_actuators
+    moved = [_moved_joint(model, i) if known else -1 for i in range(len(task.action_names))]
     position = torch.tensor([_span(model, j) for j in scalar], dtype=torch.float64)
     velocity = position / 0.25
     return Robot(

@@ -125,6 +125,11 @@ class Task:
         return self.command is not None or self.drive.weld is not None
 
     @property
+    def of_actuators(self) -> bool:
+        """Whether there is one action for each actuator, whatever becomes of it on its way."""
+        return self.drive.weld is None and len(self.action_bounds[0]) == self.model.nu
+
+    @property
     def action_names(self) -> tuple[str, ...]:
         """What the numbers of an action are called: the actuators, or ``action0`` and so on.
 
@@ -135,7 +140,7 @@ class Task:
             >>> known_task("FetchPush-v4").action_names
             ('action0', 'action1', 'action2', 'action3')
         """
-        if self.converts:
+        if not self.of_actuators:
             return tuple(f"action{i}" for i in range(len(self.action_bounds[0])))
         named = (self.model.actuator(i).name for i in range(self.model.nu))
         return tuple(name or f"actuator{i}" for i, name in enumerate(named))
