@@ -62,13 +62,18 @@ def touches(predictor: Predictor, qpos: Array) -> bool:
     model = predictor.system.task.model
     data = mujoco.MjData(model)
     for one in qpos.reshape(-1, model.nq):
-        data.qpos[:] = one
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_collision(model, data)
+        _meet(model, data, one)
         if data.ncon:
             return True
     return False
+
+
+def _meet(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array) -> None:
+    """Put the robot into a position, and find what touches there."""
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_collision(model, data)
 
 
 def likelier(
@@ -198,10 +203,7 @@ class _Touch:
 
     def _normals(self, qpos: Array) -> Array | None:
         model, data = self._model, self._data
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_collision(model, data)
+        _meet(model, data, qpos)
         found = []
         for c in range(data.ncon):
             contact = data.contact[c]

@@ -50,8 +50,7 @@ def robot_of_env(env: Any) -> Robot:
     if size == len(robot.actuators):
         return robot
     # it makes something else of its actions, as the Fetch arms do
-    actions = _actions(env)
-    return replace(robot, **actions)
+    return replace(robot, **_actions(env))
 
 
 def _robot_of_specs(env: EnvBase) -> Robot:
