@@ -1,6 +1,7 @@
 """Where contacts are met by chance, noise makes what a covariance of another simulator denies."""
 
 import importlib
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,8 +12,8 @@ from torchrl_bayessim.diagnosis.chance_contacts import trusted_less
 from torchrl_bayessim.diagnosis.modes import Mode
 from torchrl_bayessim.diagnosis.objective import Objective, Point, units_of
 from torchrl_bayessim.diagnosis.prediction import Predictor
-from torchrl_bayessim.diagnosis.preparation import Prepared
-from torchrl_bayessim.diagnosis.prepared_anew import with_less_trust
+from torchrl_bayessim.diagnosis.preparation import Prepared, Started
+from torchrl_bayessim.diagnosis.prepared_anew import with_less_trust, with_other_logs
 from torchrl_bayessim.diagnosis.refit import refit
 from torchrl_bayessim.diagnosis.segments import cut_for_fits
 from torchrl_bayessim.diagnosis.whitening import whitening
@@ -123,6 +124,34 @@ def test_beside_what_was_found_segments_are_trusted_less_and_parameters_fitted_a
     assert squares(less.sets["train"], found).mean() < 1.4
     again = refit(less.sets["train"], [less.nominal.point], iterations=0)[0]
     np.testing.assert_allclose(less.nominal.innovations, again.innovations, atol=1e-6)
+
+
+def test_what_was_put_down_to_chance_still_is_where_logs_or_noise_are_others(monkeypatch):
+    objective, point = seen_from_elsewhere(running(3))
+    nominal = refit(objective, [point], iterations=0)[0]
+    prepared = Prepared(
+        objective.predictor, {"train": objective}, {}, NOISE, "", 10, nominal, (), Mode()
+    )
+    monkeypatch.setattr(Started, "fitted", lambda *_: prepared)
+    monkeypatch.setattr(Mode, "noise", lambda *_, **__: (NOISE, ""))
+    anew = lambda before: with_other_logs(before, {"train": []}, generator=np.random.default_rng(1))
+    assert anew(prepared) is prepared
+    unit = units_of([effect("viscous_friction")], objective.predictor.system.robot)[0]
+    found = Point(point.z, {unit: 1e-6})
+    again = anew(replace(prepared, beside=found))
+    assert again.beside is found
+    assert squares(again.sets["train"], found).mean() < 1.4
+
+
+def test_segments_that_are_trusted_less_do_not_count_for_less_twice():
+    objective, point = seen_from_elsewhere(running(3))
+    robust = objective.weighted(point)
+    loud = squares(objective, point) > 20.0
+    assert (robust.whitening.weights[loud] < 0.6).all()
+    less = trusted_less(robust, point, noise=NOISE, generator=np.random.default_rng(1))
+    trusted = less.whitening.weights
+    assert trusted[loud].mean() > 2 * robust.whitening.weights[loud].mean()
+    assert trusted.max() == 1.0
 
 
 @pytest.mark.parametrize(("left", "searched"), [(3.0, 2), (1.5, 1)])

@@ -70,7 +70,10 @@ def trusted_less(
     less = objective.whitened(replace(whitening, inverse=inverse, drift=drift))
     by_chance = squares[loud] - (less.take(loud).unweighted([point])[0] ** 2).mean(-1)
     left = np.maximum(squares - 1.0, 0.0).sum()
-    return less if by_chance.sum() > _PART * left else None
+    if by_chance.sum() <= _PART * left:
+        return None
+    # what made them loud was why they counted for less: not twice for one reason
+    return less if (whitening.weights == 1.0).all() else less.weighted(point)
 
 
 def _made_by_noise(

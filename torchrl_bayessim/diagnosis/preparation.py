@@ -51,6 +51,7 @@ class Prepared:
         nominal: The fit of the parameters alone.
         alarms: What the reader must know.
         mode: What is predicted and compared.
+        beside: The simulator with effects beside which chance was looked for; none if it was not.
     """
 
     predictor: Predictor
@@ -62,6 +63,7 @@ class Prepared:
     nominal: Fit
     alarms: tuple[str, ...]
     mode: Mode
+    beside: Point | None = None
 
     @property
     def names(self) -> dict[str, tuple[str, ...]]:

@@ -41,7 +41,7 @@ def with_other_logs(
     noise, source = mode.noise(predictor, parts["train"], history=history, alarms=alarms)
     alarms = tuple(dict.fromkeys(alarms))
     started = Started(predictor, mode, history, prepared.horizon, noise, source, alarms)
-    return started.fitted(parts, generator)
+    return _trusted_as(prepared, started.fitted(parts, generator), generator)
 
 
 def with_less_noise(
@@ -70,7 +70,7 @@ def with_less_noise(
     started = Started(
         predictor, prepared.mode, history, prepared.horizon, noise, source, tuple(alarms)
     )
-    return started.fitted(prepared.logs, generator)
+    return _trusted_as(prepared, started.fitted(prepared.logs, generator), generator)
 
 
 def with_less_trust(
@@ -92,4 +92,11 @@ def with_less_trust(
         return None
     sets = {**prepared.sets, **less}
     nominal = refit(sets["train"], [prepared.nominal.point])[0]
-    return replace(prepared, sets=sets, nominal=nominal)
+    return replace(prepared, sets=sets, nominal=nominal, beside=found)
+
+
+def _trusted_as(before: Prepared, anew: Prepared, generator: np.random.Generator) -> Prepared:
+    """Return what was prepared anew with chance looked for where it was before."""
+    if before.beside is None:
+        return anew
+    return with_less_trust(anew, before.beside, generator=generator) or anew
