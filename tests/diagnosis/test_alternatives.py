@@ -40,9 +40,28 @@ def test_a_law_that_bends_is_tried_in_the_place_of_an_effect_with_as_many_number
     shift = [Unit("com_shift", where) for where in ("x", "y")[:places]]
     best, aside = plain(shift, 300.0), plain([PAYLOAD], 305.0)
     known_numbers = {best: places, aside: numbers}
-    monkeypatch.setattr(alternatives, "fitted_numbers", lambda _, model, __: known_numbers[model])
+    monkeypatch.setattr(alternatives, "fitted_numbers", lambda model, _: known_numbers[model])
     monkeypatch.setattr(alternatives, "bendable", lambda _, units: PAYLOAD in units)
     monkeypatch.setattr(alternatives, "with_fitted_forms", lambda *_: aside)
     known = [plain([PAYLOAD], 9000.0), plain([PAYLOAD], 8000.0), plain([DRAG], 7000.0)]
     found = alternatives._bent(("train", "validation"), best, known, [])
     assert found == [aside] * count
+
+
+def test_what_explains_nearly_as_much_is_bent_to_the_data(monkeypatch):
+    """Only the best with each effect, and none that explains much less or has nothing to bend."""
+    bent = {}
+
+    def forms(_, __, model, ___):
+        bent[model] = plain(list(model.units), 300.0) if PAYLOAD in model.units else model
+        return bent[model]
+
+    monkeypatch.setattr(alternatives, "with_forms_anew", forms)
+    monkeypatch.setattr(alternatives, "bendable", lambda _, units: OFFSET not in units)
+    start, best = plain([], 10_000.0), plain([GAIN], 310.0)
+    near = [plain([PAYLOAD], 500.0), plain([PAYLOAD], 600.0), plain([DRAG], 700.0)]
+    others = [plain([Unit("late")], 900.0), plain([OFFSET], 400.0)]
+    known = [*near, *others]
+    found = alternatives._in_their_forms(("train", "validation"), best, known, [], start=start)
+    assert set(bent) == {near[0], near[2]}
+    assert found == [bent[near[0]]]

@@ -179,3 +179,37 @@ def test_the_likeliest_group_of_equals_comes_to_the_front(monkeypatch, apart, fr
     found = replace(selection(best), alternatives={"com_shift": tuple(others)})
     sets = dict.fromkeys(("train", "validation"))
     assert set(settled(found, "com_shift", sets).best.names) == {front}
+
+
+@pytest.mark.parametrize(("parts", "front"), [((1.0, 1.0), 1), ((0.0, 1.0), 0)])
+@pytest.mark.parametrize("name", ["payload", "armature"])
+def test_one_gain_comes_to_the_front_of_bodies_that_are_all_heavier(
+    monkeypatch, name, parts, front
+):
+    monkeypatch.setattr(confusion, "parts", lambda *_: [])
+    heavier, gain = model(1.0, name), model(1.0, "action_gain")
+    unit = replace(heavier.units[0], where="all", direction=parts)
+    point = Point(np.zeros(1), {unit: 0.5})
+    heavier = replace(heavier, fit=replace(heavier.fit, units=(unit,), point=point))
+    share = np.sqrt(1.0 + 3.0 / float((gain.validation**2).sum()))  # likelier, but not by much
+    gain = replace(gain, validation=share * gain.validation)
+    found = replace(selection(heavier), alternatives={name: (gain,)})
+    sets = dict.fromkeys(("train", "validation"))
+    assert settled(found, name, sets).best is (heavier, gain)[front]
+
+
+@pytest.mark.parametrize(("gained", "front"), [(4.0, 0), (20.0, 1)])
+def test_a_number_of_a_law_that_was_fitted_has_its_price(monkeypatch, gained, front):
+    monkeypatch.setattr(confusion, "parts", lambda *_: [])
+    best, other = model(1.0, "com_shift"), model(1.0, "action_gain")
+    unit = replace(other.units[0], effect=effect("action_gain", bend=-0.4))
+    point = Point(np.zeros(1), {unit: 0.5})
+    share = np.sqrt(1.0 - gained / float((other.validation**2).sum()))
+    fit = replace(other.fit, units=(unit,), point=point)
+    bent = replace(other, fit=fit, validation=share * other.validation)
+    found = replace(
+        selection(best), alternatives={"com_shift": (bent,)}, offered=(*best.units, *other.units)
+    )
+    assert exchanged(best, found.alternatives, found.offered) is (best, bent)[front]
+    sets = dict.fromkeys(("train", "validation"))
+    assert settled(found, "com_shift", sets).best is (best, bent)[front]

@@ -9,6 +9,7 @@ from __future__ import annotations
 __all__ = ["alternatives", "exchanged", "kind", "leaves_less_to_do", "stands_in"]
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -17,13 +18,12 @@ from ..effects.effect import Effect
 from ..effects.joints import CoulombFriction
 from ..effects.transmission import ServoDeadBand
 from .explanations import compare
-from .form_fit import bendable, fitted_numbers, with_fitted_forms
+from .form_fit import bendable, fitted_numbers, priced, with_fitted_forms, with_forms_anew
 from .model import (
     LIKELY,
     Model,
     as_good,
     best_by_effect,
-    criterion,
     gain,
     judged_fits,
     needed,
@@ -36,6 +36,7 @@ from .screening import Screen
 _ALIKE = 4  # models with an effect of the same group in its place
 _RIVALS = 6  # models with another effect in the place of one
 _LAWS = 2  # of those that bend
+_NEARLY, _FORMS = 0.05, 3  # of what is explained; of those that explain all but that
 _MORE, _LITTLE = 5.0, 0.05  # mean squared innovation; share of friction's range, to start from
 _SMALLER = 0.75  # times: all strengths of an equal that is plainer
 _LESS = 0.5  # times: of what an effect did that made up for another
@@ -92,6 +93,7 @@ def alternatives(
         known += _sticking((train, validation), best, name, units)
         if train.width > Objective.width:
             known += _nearer((train, validation), best, name, known)
+        known += _in_their_forms((train, validation), best, known, offered, start=start)
         result[name] = tuple(known)
     return result
 
@@ -129,12 +131,37 @@ def _bent(
 
     With no more numbers: a payload that is held aside moves the centre of mass in two directions.
     """
-    train, most = sets[0], fitted_numbers(sets[0], best, offered)
+    train, most = sets[0], fitted_numbers(best, offered)
     fewer = [m for m in known if len(m.units) < len(best.units)]
     laws = [m for m in fewer if bendable(train, m.beyond(best)) and not as_good(best, m)]
     plain = list(best_by_effect(laws, best).values())[:_LAWS]
     fitted = [with_fitted_forms(*sets, model, offered) for model in plain]
-    return [m for m in fitted if m not in plain and fitted_numbers(train, m, offered) <= most]
+    return [m for m in fitted if m not in plain and fitted_numbers(m, offered) <= most]
+
+
+def _in_their_forms(
+    sets: tuple[Objective, Objective],
+    best: Model,
+    known: Sequence[Model],
+    offered: Collection[Unit],
+    *,
+    start: Model,
+) -> list[Model]:
+    """Return what explains nearly as much with its laws, and those beside it, bent to the data.
+
+    The best model's laws were bent beside its own effects: a cause in another form would lose to
+    what imitates it.
+    """
+    explained = float((start.deviances() - best.deviances()).sum())
+    near = [
+        m
+        for m in known
+        if bendable(sets[0], m.units)
+        and float((m.deviances() - best.deviances()).sum()) < _NEARLY * explained
+    ]
+    plain = list(best_by_effect(near, best).values())[:_FORMS]
+    fitted = [with_forms_anew(*sets, model, offered) for model in plain]
+    return [m for m in fitted if m not in plain]
 
 
 def _sliding(
@@ -215,23 +242,31 @@ def _raced(sets: tuple[Objective, Objective], starts: Sequence[Point], best: Mod
     return judged_fits(*sets, starts, race=best.fit.cost) if starts else []
 
 
-def exchanged(best: Model, others: Mapping[str, Sequence[Model]]) -> Model:
+def exchanged(
+    best: Model, others: Mapping[str, Sequence[Model]], offered: Collection[Unit] = ()
+) -> Model:
     """Return the best of a model and its alternatives, itself unless chance is unlikely.
 
     Or unless one that is as good leaves less for the others to do (`leaves_less_to_do`).
+
+    Args:
+        best: The model.
+        others: Its alternatives, by the effect in whose place they have another.
+        offered: The effects as they were offered: numbers that were fitted have their price.
     """
+    cost = partial(priced, offered=offered, dispersion=best.dispersion())
     every = [model for models in others.values() for model in models]
     candidates = [
         m for m in every if len(m.units) <= len(best.units) or gain(best, m) > needed(best, m)
     ]
-    first = min([best, *candidates], key=lambda m: criterion(m, best.dispersion()))
-    better_by = criterion(best, best.dispersion()) - criterion(first, best.dispersion())
+    first = min([best, *candidates], key=cost)
+    better_by = cost(best) - cost(first)
     if len(first.units) > len(best.units) and as_good(first, best):
         return best  # something is wrong with both, and more strengths mend more of it
     if better_by > LIKELY:
         return first
     plainer = [m for m in every if leaves_less_to_do(best, m)]
-    return min(plainer, key=lambda m: criterion(m, best.dispersion()), default=best)
+    return min(plainer, key=cost, default=best)
 
 
 def leaves_less_to_do(best: Model, other: Model) -> bool:

@@ -68,9 +68,9 @@ def fewest(
     """
     singles = [m for m in models if len(_new_names(base, m)) == 1]
     if better is None:  # a law in a wrong form may fit some runs and predict no others
-        bent = _worth_bending(sets, base, _in_other_forms(sets, base, singles, offered), offered)
-        least = priced(sets[0], base, offered)
-        return next((m for m in bent if priced(sets[0], m, offered) < least), None)
+        bent = _worth_bending(base, _in_other_forms(sets, base, singles, offered), offered)
+        least = priced(base, offered)
+        return next((m for m in bent if priced(m, offered) < least), None)
     several, smaller = len(_new_names(base, better)) > 1, None
     if several:
         smaller = chosen(base, singles)
@@ -84,12 +84,12 @@ def fewest(
     elif better.mean_square < WHITE:
         return better
     tried = _in_other_forms(sets, base, singles, offered)
-    fitted = _worth_bending(sets, base, tried, offered)
+    fitted = _worth_bending(base, tried, offered)
     if several:
         better = next((m for m in fitted if as_good(better, m)), better)
         return smaller if smaller is not None and not worth(base, better, models) else better
     own = tried.get(better) or with_fitted_forms(*sets, better, offered)
-    return min([own, *fitted], key=lambda m: priced(sets[0], m, offered))
+    return min([own, *fitted], key=lambda m: priced(m, offered))
 
 
 def _no_simpler(
@@ -99,12 +99,10 @@ def _no_simpler(
 
     A wave has a rate and a phase beside its strength, with which it is a spring that is off center.
     """
-    train = sets[0]
-    fewest = fitted_numbers(train, pair, offered)
-    if fitted_numbers(train, single, offered) < fewest:
+    if fitted_numbers(single, offered) < fitted_numbers(pair, offered):
         return False
     single = with_fitted_forms(*sets, single, offered)
-    return priced(train, pair, offered) < priced(train, single, offered)
+    return priced(pair, offered) < priced(single, offered)
 
 
 def _in_other_forms(
@@ -130,7 +128,6 @@ def _in_other_forms(
 
 
 def _worth_bending(
-    sets: tuple[Objective, Objective],
     base: Model,
     tried: Mapping[Model, Model],
     offered: Sequence[Unit],
@@ -138,7 +135,7 @@ def _worth_bending(
     """Return those that gain by their bent laws, and that explain what no fit saw, best first."""
     fitted = [bent for plain, bent in tried.items() if bent is not plain]
     fitted = [bent for bent in fitted if gain(base, bent) > needed(base, bent)]
-    return sorted(fitted, key=lambda m: priced(sets[0], m, offered))
+    return sorted(fitted, key=lambda m: priced(m, offered))
 
 
 def _as_offered(

@@ -9,10 +9,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from ..effects.effect import Effect
+from ..effects.joints import Armature
 from ..effects.transmission import ServoDeadBand
 from .alternatives import kind, leaves_less_to_do
 from .elimination import parts, without_idle
-from .model import Model, as_good, criterion, judged_fits
+from .form_fit import priced
+from .model import Model, as_good, judged_fits
 from .objective import Objective, Point
 from .selection import Selection
 
@@ -22,6 +24,7 @@ _LAST = 0.01  # of what an effect explains: too little to prefer one law to anot
 _FORM = 0.1  # of the same: how well the form of a law is known
 _ELSEWHERE = 0.25  # of the same, by friction in contacts: chattering ones no fit follows exactly
 _OTHER = 0.03  # of the same, by a law of another kind, where the best is not the true one
+_COINCIDENCE = 6.0  # of a deviance: odds of 1 to 20
 _MISSING = 0.01  # p-value of what a law leaves if it is the true one
 
 
@@ -150,7 +153,7 @@ def stand_in(selection: Selection, rival: Model) -> str:
 def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> Selection:
     """Return the selection with that one of equals in front that explains most.
 
-    Of training and validation, with a price for each strength: test runs choose nothing. Where more
+    Of training and validation, with a price for each number: test runs choose nothing. Where more
     than noise is left, deviances count by so much less (quasi-likelihood, Wedderburn 1974), or the
     one with the most strengths would mend most of that. Of those that explain the same it is one of
     the likeliest group, all its effects together; of late commands and late sensors, the one with
@@ -160,7 +163,7 @@ def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> S
     up for, the one that leaves less.
     """
     equals = [selection.best, *rivals(selection, name)]
-    costs = {model: criterion(model, selection.best.dispersion()) for model in equals}
+    costs = {model: _cost(model, selection) for model in equals}
     least = min(costs.values())
     same = [model for model in equals if costs[model] - least < _SAME]
     same = _of_the_likeliest_group(same, costs, selection, name)
@@ -183,6 +186,20 @@ def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> S
             stand_in(selection, first): others,
         },
     )
+
+
+def _cost(model: Model, selection: Selection) -> float:
+    """Return the criterion, with a price for numbers of laws, and one for a coincidence.
+
+    That all bodies of a robot are heavier in the proportion of their ranges hardly happens: what
+    one cause of another kind does, such as a gain of commands, looks like it.
+    """
+    everywhere = sum(
+        unit.effect.group == Armature.group and sum(part != 0 for part in unit.direction) > 1
+        for unit in model.units
+    )
+    dispersion = selection.best.dispersion()
+    return priced(model, selection.offered, dispersion=dispersion) + _COINCIDENCE * everywhere
 
 
 def _of_the_likeliest_group(

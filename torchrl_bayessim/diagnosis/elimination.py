@@ -139,7 +139,7 @@ def without_stopgaps(
             if (fitted := anew(part, race=model.fit.cost)) is not part
         ]
         dispersion = model.dispersion()
-        cost = partial(priced, train, offered=offered, dispersion=dispersion)
+        cost = partial(priced, offered=offered, dispersion=dispersion)
         instead = [m for m in smaller if cost(m) < cost(model) or as_good(model, m)]
         if not instead:
             break

@@ -102,20 +102,26 @@ def bendable(train: Objective, units: Iterable[Unit]) -> bool:
     )
 
 
-def priced(
-    train: Objective, model: Model, offered: Collection[Unit], *, dispersion: float = 1.0
-) -> float:
+def priced(model: Model, offered: Collection[Unit], *, dispersion: float = 1.0) -> float:
     """Return the criterion, and a price for each number of a law that was fitted."""
-    return criterion(model, dispersion) + _bent(train, model, offered) * price(model)
+    return criterion(model, dispersion) + sum(_bent(u, offered) for u in model.units) * price(model)
 
 
-def fitted_numbers(train: Objective, model: Model, offered: Collection[Unit]) -> int:
+def fitted_numbers(model: Model, offered: Collection[Unit]) -> int:
     """Return how many numbers its effects have that were fitted: strengths, and those of laws."""
-    return numbers(model) + _bent(train, model, offered)
+    return numbers(model) + sum(_bent(unit, offered) for unit in model.units)
 
 
-def _bent(train: Objective, model: Model, offered: Collection[Unit]) -> int:
-    return sum(s.paid(offered) and not s.placed for s in _shifts(train, model.units))
+def _bent(unit: Unit, offered: Collection[Unit]) -> int:
+    """Return how many numbers of a law are none that it was offered with, but for placed ones."""
+    alike = [u.effect.form for u in offered if type(u.effect) is type(unit.effect)]
+    if not alike:
+        return 0
+    return sum(
+        number in unit.effect.nuisances or value not in [form[number] for form in alike]
+        for number, value in unit.effect.form.items()
+        if number not in unit.effect.placed
+    )
 
 
 def with_forms_anew(

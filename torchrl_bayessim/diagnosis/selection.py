@@ -109,8 +109,9 @@ def select(
         units=with_forms_of(search.units, needs), first=search.screens[0], offered=units,
     )  # fmt: skip
     best, others = _settled(
-        train, validation, needs, instead, tried=search.tried, progress=progress
-    )
+        train, validation, needs, instead,
+        tried=search.tried, offered=units, progress=progress,
+    )  # fmt: skip
     found = tuple(search.screens), tuple(search.p_values), tuple(search.tried), others
     return Selection(start, best, *found, offered=tuple(units))
 
@@ -132,6 +133,7 @@ def _settled(
     instead: Callable[..., dict[str, tuple[Model, ...]]],
     *,
     tried: list[Model],
+    offered: Sequence[Unit],
     progress: Callable[[str], None],
 ) -> tuple[Model, dict[str, tuple[Model, ...]]]:
     """Return the best model, after exchanges, and the models with others instead."""
@@ -141,7 +143,7 @@ def _settled(
         progress("trying others in its place")
         others = instead(best, tried=tried)
         tried += [model for models in others.values() for model in models]
-        better = exchanged(best, others)
+        better = exchanged(best, others, offered)
         if better is best or exchanges == _EXCHANGES:
             return best, others
         best, dropped = eliminated(train, validation, exactly(train, validation, better))
