@@ -16,7 +16,8 @@ from ..logs.log import Log
 from ..logs.system import System
 from .chance_contacts import left_to_chance
 from .contacts import likelier, one_sided, settled
-from .hidden import hidden_joints
+from .fast_motion import FastMotion, fast_motion
+from .hidden import Hidden, hidden_joints
 from .modes import Mode, Trajectories, shortest
 from .noise import assumed_noise
 from .objective import Objective, Point, Unit, origin, parameters_at
@@ -118,10 +119,14 @@ def prepare(
     theta = parameters_at(system.prior, origin(system.prior))
     parts = {name: with_velocity_errors(predictor, part, theta) for name, part in parts.items()}
     noise = assumed_noise(predictor, parts["train"])
-    parts = _completed(predictor, parts, noise=noise, history=history, alarms=alarms)
-    estimated = parts["train"][0].uncertainty is not None
-    mode = mode or (Trajectories() if estimated else Mode())
     some = cut(parts["train"], min(_STEPS, rows // 2), history=history, most=_FEW)
+    hidden = hidden_joints(predictor, some, theta, noise)
+    unseen = hidden or fast_motion(predictor, parts["train"])
+    if unseen:
+        parts, note = _completed(predictor, parts, unseen, noise=noise, history=history)
+        alarms += note
+        some = cut(parts["train"], min(_STEPS, rows // 2), history=history, most=_FEW)
+    mode = mode or (Trajectories() if hidden else Mode())
     if servos(system.robot):
         # a loop of some milliseconds, which forces that are held for ten would leave open
         predictor.exactly()
@@ -208,12 +213,12 @@ def _in_contact(
 def _completed(
     predictor: Predictor,
     parts: Mapping[str, list[Log]],
+    unseen: Hidden | FastMotion,
     *,
     noise: Array,
     history: int,
-    alarms: list[str],
-) -> dict[str, list[Log]]:
-    """Return the logs with estimates of what was not measured and matters.
+) -> tuple[dict[str, list[Log]], list[str]]:
+    """Return the logs with estimates of what was not measured and matters, and a note of it.
 
     They and the parameters that they depend on are fitted in turn.
     """
@@ -221,24 +226,22 @@ def _completed(
     theta = parameters_at(prior, origin(prior))
     steps = min(_STEPS, shortest(parts) // 2)
     some = cut(parts["train"], steps, history=history, most=_FEW)
-    hidden = hidden_joints(predictor, some, theta, noise)
-    if not hidden:
-        return dict(parts)
     predictor = with_fewest_steps(predictor, some, (), z=origin(prior), noise=noise)
     curvature = 0.0
     for _ in range(_ROUNDS if prior is not None else 1):
-        train = hidden.estimated(predictor, parts["train"], theta=theta, noise=noise)
+        train = unseen.estimated(predictor, parts["train"], theta=theta, noise=noise)
         pieces = cut_for_fits(train, steps, history=history, most=_MANY)
         fit, sets = _nominal(predictor, {"train": pieces}, Mode(), noise=noise)
         theta = parameters_at(prior, fit.point.z)
         curvature = sets["train"].whitening.curvature
-    hidden.require_sure(curvature)
+    unseen.require_sure(curvature)
     found = {
-        name: hidden.estimated(predictor, logs, theta=theta, noise=noise)
+        name: unseen.estimated(predictor, logs, theta=theta, noise=noise)
         for name, logs in parts.items()
     }
-    alarms.append(hidden.note(found["train"]))
-    return found
+    if any(log.uncertainty is None for logs in found.values() for log in logs):
+        return dict(parts), []
+    return found, [unseen.note(found["train"])]
 
 
 def _nominal(

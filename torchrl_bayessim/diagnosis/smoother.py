@@ -64,12 +64,14 @@ class Filtered:
         beliefs: After each row's measurement, length ``T``.
         predicted: Before it, by row; of the first row what was given.
         gains: Of the smoother, from each row to the one before.
+        surprises: Squared innovation of each row in units of its variance, 1 on average, ``(N,)``.
     """
 
     likelihood: Array
     beliefs: list[Beliefs] = field(default_factory=list)
     predicted: list[Beliefs] = field(default_factory=list)
     gains: list[Array] = field(default_factory=list)
+    surprises: list[Array] = field(default_factory=list)
 
 
 def filtered(
@@ -104,10 +106,11 @@ def filtered(
     for t in range(length):
         if keep:
             result.predicted.append(belief)
-        belief, density = dynamics.measured(belief, t)
+        belief, density, surprise = dynamics.measured(belief, t)
         result.likelihood[:] += np.where(dynamics.record.alive[:, t], density, 0.0)
         if keep:
             result.beliefs.append(belief)
+            result.surprises.append(surprise)
         if t + 1 < length:
             belief, gain = dynamics.moved(belief, t)
             if keep:
@@ -199,8 +202,8 @@ class _Dynamics:
     forces: Array
     noise: Array
 
-    def measured(self, belief: Beliefs, t: int) -> tuple[Beliefs, Array]:
-        """Return the belief after row ``t``, and the log density of that row."""
+    def measured(self, belief: Beliefs, t: int) -> tuple[Beliefs, Array, Array]:
+        """Return the belief after row ``t``, the row's log density, and how surprising it was."""
         record, channels = self.record, self.predictor.sensing.channels
         position = self.predictor.tangent.difference(belief.qpos, record.qpos[:, t])
         both = np.concatenate([position, record.qvel[:, t] - belief.qvel], -1)
@@ -216,7 +219,8 @@ class _Dynamics:
         kept = np.eye(seen.shape[2]) - gain @ np.eye(seen.shape[2])[channels]
         noise = (gain * self.noise**2) @ gain.swapaxes(1, 2)
         covariance = _symmetric(kept @ belief.covariance @ kept.swapaxes(1, 2) + noise)
-        return _displaced(self.predictor, belief, step, covariance), density
+        surprise = np.minimum(distance, _LOST) / innovation.shape[1]
+        return _displaced(self.predictor, belief, step, covariance), density, surprise
 
     def moved(self, belief: Beliefs, t: int) -> tuple[Beliefs, Array]:
         """Return the belief one control step later, and the smoother's gain."""
