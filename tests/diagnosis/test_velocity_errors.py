@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.fast_motion import FastMotion
 from torchrl_bayessim.diagnosis.prediction import Predictor
 from torchrl_bayessim.diagnosis.velocity_errors import with_velocity_errors
 from torchrl_bayessim.envs.task import Task
@@ -72,13 +73,27 @@ def test_measured_velocities_are_not_doubted():
     assert after is measured
 
 
-def test_what_is_faster_than_its_sampling_is_not_testable():
+def test_what_is_faster_than_its_sampling_the_simulator_tells():
     """A torque that turns in every row: the arm swings forth and back in between."""
+    effects = ["coulomb_friction", "action_gain"]
     logs = [driven(seed, hertz=9.5, torque=15.0)[0] for seed in range(6)]
-    report = diagnose(system(), None, logs, effects=["coulomb_friction", "action_gain"])
+    report = diagnose(system(), None, logs, effects=effects)
+    assert report.verdict == "none"
+    assert any("too fast for 20 rows a second" in alarm for alarm in report.alarms)
+    weak = [replace(log, ctrl=log.ctrl / 0.8) for log in logs]  # commands larger than what arrives
+    report = diagnose(system(), None, weak, effects=effects)
+    assert [effect.name for effect in report.effects] == ["action_gain"]
+    assert report.effects[0].strength == pytest.approx(-0.2, abs=0.02)
+
+
+def test_what_neither_tells_is_not_testable(monkeypatch):
+    monkeypatch.setattr(FastMotion, "estimated", lambda self, predictor, logs, **_: list(logs))
+    effects = ["coulomb_friction", "action_gain"]
+    logs = [driven(seed, hertz=9.5, torque=15.0)[0] for seed in range(6)]
+    report = diagnose(system(), None, logs, effects=effects)
     assert report.verdict == "not_testable"
     assert "sample faster" in report.summary
     assert any("too fast for velocities" in alarm for alarm in report.alarms)
     calm = [driven(seed, hertz=0.3, torque=0.3)[0] for seed in range(6)]
-    report = diagnose(system(), None, calm, effects=["coulomb_friction", "action_gain"])
+    report = diagnose(system(), None, calm, effects=effects)
     assert report.verdict == "none"

@@ -63,6 +63,7 @@ def test_of_chance_on_a_small_gap_only_what_is_sure_is_named(sure, refit, said):
         (0.99, 1e-3, (1.0, 1.0), "none"),  # test runs are further off with it
         (0.99, 1e-3, (3.0, 1.2), "named_partial"),  # but validation runs are not
         (0.99, 1e-40, (1.0, 1.0), "named_partial"),
+        (1.2, 1e-40, (3.0, 1.2), "none"),  # and test runs say plainly that it is nothing
     ],
 )
 def test_a_cause_of_a_gap_too_small_to_show_must_help_somewhere(left, sure, validation, said):

@@ -62,18 +62,27 @@ def trusted_less(
     loud, larger = loud[chance], larger[chance]
     if not len(loud):
         return None
-    whitening = objective.whitening
-    inverse, drift = whitening.inverse.copy(), whitening.drift.copy()
-    scale = 1.0 / np.sqrt(np.repeat(larger, len(noise), axis=1))
-    inverse[loud] *= scale[..., None]
-    drift[loud] *= scale
-    less = objective.whitened(replace(whitening, inverse=inverse, drift=drift))
-    by_chance = squares[loud] - (less.take(loud).unweighted([point])[0] ** 2).mean(-1)
+    less = _scaled(objective, loud, larger)
+    # a few draws do not show how far chance goes: what is louder yet tells no more than noise
+    still = (less.take(loud).unweighted([point])[0] ** 2).mean(-1)
+    less = _scaled(less, loud, np.repeat(np.maximum(still, 1.0)[:, None], larger.shape[1], 1))
+    by_chance = squares[loud] - np.minimum(still, 1.0)
     left = np.maximum(squares - 1.0, 0.0).sum()
     if by_chance.sum() <= _PART * left:
         return None
     # what made them loud was why they counted for less: not twice for one reason
-    return less if (whitening.weights == 1.0).all() else less.weighted(point)
+    return less if (objective.whitening.weights == 1.0).all() else less.weighted(point)
+
+
+def _scaled(objective: Objective, segments: NDArray[np.int64], larger: Array) -> Objective:
+    """Return the objective with variances so much larger in rows ``(S, K)`` of some segments."""
+    whitening = objective.whitening
+    inverse, drift = whitening.inverse.copy(), whitening.drift.copy()
+    channels = drift.shape[1] // larger.shape[1]
+    scale = 1.0 / np.sqrt(np.repeat(larger, channels, axis=1))
+    inverse[segments] *= scale[..., None]
+    drift[segments] *= scale
+    return objective.whitened(replace(whitening, inverse=inverse, drift=drift))
 
 
 def _made_by_noise(

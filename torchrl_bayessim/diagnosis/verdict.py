@@ -49,6 +49,7 @@ _CERTAIN = 1e-15  # p-value of a gap that is too small to be seen at a glance
 _MOST = 0.5  # of the joints without measured velocity
 _NOISE_AGAIN = 2.0  # mean squared innovation: as much again as the noise
 _ALL = 0.98
+_WORSE = 1.1  # times what parameters alone leave on test runs
 
 
 def conclude(
@@ -189,8 +190,9 @@ class _Weighed:
         """Return the verdict on effects that were found."""
         measured = self.measured
         if measured.refit <= NEGLIGIBLE and measured.excess_ci[0] <= 0:
-            # seen by the search, but too small to matter on the test runs
-            return "named_partial" if self.significant else "none"
+            # seen by the search, but too small to matter on the test runs, which it must not worsen
+            worse = measured.effects > _WORSE * measured.refit
+            return "named_partial" if self.significant and not worse else "none"
         if self.unsaid:
             sure = self.visible or self.certain
             borne_out = self.elsewhere or self.helps
