@@ -12,13 +12,14 @@ from test_diagnose import ARM, BOUNDS, SOME, logs, system
 from torchrl_bayessim.diagnosis.credit import unit_credit
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.divergence import diverges_throughout
-from torchrl_bayessim.diagnosis.doubts import alike, doubts, numerical
+from torchrl_bayessim.diagnosis.doubts import alike, doubts, numerical, slow
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.refit import Fit
 from torchrl_bayessim.diagnosis.report import Finding
 from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
 from torchrl_bayessim.diagnosis.verdict import _Weighed
 from torchrl_bayessim.effects.catalogue import effect as catalogued
+from torchrl_bayessim.effects.disturbance import Cogging
 from torchrl_bayessim.effects.robot import robot_of
 from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.inference.priors import BoxPrior
@@ -192,6 +193,17 @@ def test_two_causes_that_act_alike_at_one_joint_are_doubted(names, doubted):
     assert bool(alike(units, robot)) == doubted
     if doubted:
         assert "payload and armature at hinge act alike: they may stand" in alike(units, robot)[0]
+
+
+@pytest.mark.parametrize(
+    ("number", "joint", "doubted"),
+    [(2.0, "hinge", True), (2.3, "hinge", False), (2.0, "slide", False)],
+)
+def test_cogging_that_is_as_slow_as_what_a_mass_does_is_doubted(number, joint, doubted):
+    xml = ARM.replace('name="hinge"', f'name="hinge" type="{joint}"')
+    robot = robot_of(Task(model=mujoco.MjModel.from_xml_string(xml), frame_skip=5))
+    units = [u for u in units_of([Cogging(number=number)], robot) if u.where != "all"]
+    assert bool(slow(units, robot)) == doubted
 
 
 def test_a_tilt_along_a_joints_axis_has_no_sign():

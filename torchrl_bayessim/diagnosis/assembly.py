@@ -19,7 +19,7 @@ from .candidates import candidates, concluded
 from .confusion import settled
 from .credit import credit_of, unit_credit, worthwhile
 from .divergence import divergence_alarms, diverges_throughout
-from .doubts import alike, baseless, doubts, numerical, unsigned
+from .doubts import alike, baseless, doubts, numerical, slow, unsigned
 from .experiment import experiments
 from .figures import figures
 from .form_fit import with_slopes_of_forms
@@ -106,6 +106,7 @@ def assemble(
         doubts=[
             *doubts(found.effects, units, prepared),
             *alike(best.units, system.robot),
+            *slow(best.units, system.robot),
             *unsigned(best, prepared),
             *unrepeated_alarms(best, prepared.sets["train"].segments, together),
             *worse_rollouts(rollouts),

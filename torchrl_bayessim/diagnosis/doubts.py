@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["alike", "baseless", "doubts", "numerical", "unsigned"]
+__all__ = ["alike", "baseless", "doubts", "numerical", "slow", "unsigned"]
 
 from collections.abc import Sequence
 
@@ -10,9 +10,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from ..effects.disturbance import Cogging
 from ..effects.joints import Armature, CoulombFriction
 from ..effects.robot import Robot
 from ..effects.transmission import servo_damping
+from ..effects.units import slides
 from .cells import plain
 from .model import Model, as_good, judged_fits
 from .objective import Point, Unit
@@ -20,6 +22,7 @@ from .preparation import Prepared
 from .report import Finding
 
 _EDGE = 0.98  # of the largest strength that is looked for
+_FEWEST = 2  # periods per turn
 _ANYTHING = -np.inf, np.inf
 
 
@@ -62,6 +65,21 @@ def alike(units: Sequence[Unit], robot: Robot) -> list[str]:
                 names = f"{plain(other.name)} and {plain(one.name)}"
                 found[names] = f"{names} at {one.where} act alike: they may stand for another cause"
     return list(found.values())
+
+
+def slow(units: Sequence[Unit], robot: Robot) -> list[str]:
+    """Return an alarm for cogging of a hinge with two periods per turn, the fewest looked for.
+
+    One is gravity's, and what a body's mass does beside it repeats once or twice a turn.
+    """
+    return [
+        f"{plain(unit.name)} at {unit.where} was fitted to {_FEWEST} periods per turn, the fewest "
+        "that are looked for: it may stand for what a mass or a spring does"
+        for unit in units
+        if isinstance(unit.effect, Cogging)
+        and not slides(robot, unit.joint(robot))
+        and unit.effect.number < _FEWEST / _EDGE
+    ]
 
 
 def unsigned(best: Model, prepared: Prepared) -> list[str]:
