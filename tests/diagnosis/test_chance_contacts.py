@@ -94,6 +94,17 @@ def test_what_a_robot_lacks_is_not_put_down_to_chance():
     assert trusted_less(objective, point, noise=NOISE, generator=generator) is None
 
 
+@pytest.mark.parametrize(("seed", "damping"), [(3, 4.0), (3, 7.0), (14, 4.0)])
+def test_of_what_a_robot_lacks_chancy_segments_keep_what_no_draw_makes(seed, damping):
+    objective, point = seen_from_elsewhere(running(seed, damping=damping))
+    clean, _ = seen_from_elsewhere(running(seed))
+    draw = lambda: np.random.default_rng(1)
+    less = trusted_less(objective, point, noise=NOISE, generator=draw()) or objective
+    nothing = trusted_less(clean, point, noise=NOISE, generator=draw())
+    assert squares(less, point).mean() > 1.5 * squares(nothing, point).mean()
+    assert squares(less, point).max() > 3.0
+
+
 def test_the_same_noise_is_drawn_for_the_same_seed():
     objective, point = seen_from_elsewhere(running(3))
     one, two = (

@@ -2,10 +2,12 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 from test_chance_contacts import NOISE, PHYSICS, running
+from test_diagnose import ARM
 from test_diagnose import logs as arm_logs
 from test_diagnose import system as arm
 
@@ -15,6 +17,7 @@ from torchrl_bayessim.diagnosis.modes import Mode
 from torchrl_bayessim.diagnosis.prediction import Predictor
 from torchrl_bayessim.diagnosis.preparation import prepare
 from torchrl_bayessim.diagnosis.velocity_errors import with_velocity_errors
+from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.envs.tasks.catalogue import known_task
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.logs.columns import default_columns
@@ -83,6 +86,35 @@ def test_a_simulator_tells_velocities_that_polynomials_cannot(robot, theta, bett
     assert "too fast for 20 rows a second" in motion.note(found)
 
 
+def test_unknown_forces_are_those_of_the_logs_that_the_simulator_is_fitted_to(robot):
+    predictor, logs, _ = robot
+    given = {"theta": WRONG, "noise": NOISE[:9]}
+    motion = fast_motion(predictor, logs).settled(predictor, logs[:4], **given)
+    together = motion.estimated(predictor, logs, **given)
+    alone = motion.estimated(predictor, logs[4:5], **given)
+    deviations = [one.uncertainty.diagonal(dim1=1, dim2=2).sqrt() for one in (together[4], *alone)]
+    np.testing.assert_allclose(deviations[0][1:], deviations[1][1:], rtol=0.3, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "body", ["", '<body name="ball" pos="5 0 2"><freejoint/><geom size=".1"/></body>']
+)
+def test_of_free_bodies_no_error_is_known_and_none_is_asked_for(body):
+    arm_and_body = ARM.replace("</worldbody>", body + "</worldbody>")
+    task = Task(model=mujoco.MjModel.from_xml_string(arm_and_body), frame_skip=10)
+    predictor, size = Predictor(System(task=task), threads=1), task.model.nv
+    log = arm_logs()[0]
+    rows = torch.ones(len(log), 1, dtype=torch.float64)
+    fast = replace(
+        log,
+        qpos=rows * torch.from_numpy(task.model.qpos0.copy()),
+        qvel=torch.sin(torch.arange(len(log)).double())[:, None].expand(-1, size).contiguous(),
+        velocity_gain=torch.full((size,), 30.0).double(),
+        velocity_error=torch.eye(size)[list(predictor.system.robot.dof_index)].sum(0).double(),
+    )
+    assert fast_motion(predictor, [fast]).dofs == tuple(range(size))
+
+
 def test_rows_that_the_simulator_does_not_expect_make_estimates_less_sure(robot):
     predictor, logs, _ = robot
     motion = fast_motion(predictor, logs)
@@ -100,7 +132,6 @@ def test_rows_that_the_simulator_does_not_expect_make_estimates_less_sure(robot)
 def test_slow_motion_is_left_to_polynomials():
     predictor = Predictor(arm(), threads=1)
     logs = arm_logs()
-    assert not fast_motion(predictor, logs)
     gain = torch.full_like(logs[0].velocity_gain, 30.0)
     for error, told in ((0.001, ()), (10.0, (0,))):
         guessed = [replace(g, velocity_gain=gain, velocity_error=error + 0 * gain) for g in logs]

@@ -11,7 +11,7 @@ from torchrl_bayessim.diagnosis.verdict import _Weighed
 
 def verdict(
     *, refit, left, sure, chance=False, validation=(1.0, 1.0), raw=9.0, ci=(-2.0, 1.0), count=1,
-    by_chance=1.0, laws=1,
+    by_chance=1.0, laws=1, guessed=False,
 ):  # fmt: skip
     """Return the verdict on one effect: mean squared innovations of test runs and validation."""
     explained = (refit - left) / max(refit - 1.0, 1e-9)
@@ -38,6 +38,7 @@ def verdict(
         [SimpleNamespace(p_value=sure)] * count,
         scattered={"losses"} if chance else set(),
         alpha=0.01,
+        guessed=guessed,
     )
     return weighed.named(ambiguous=False)
 
@@ -68,6 +69,23 @@ def test_of_chance_on_a_small_gap_only_what_is_sure_is_named(sure, refit, said):
 )
 def test_a_cause_of_a_gap_too_small_to_show_must_help_somewhere(left, sure, validation, said):
     assert verdict(refit=0.95, left=left, sure=sure, validation=validation) == said
+
+
+@pytest.mark.parametrize(("sure", "said"), [(1e-3, "none"), (1e-40, "named_partial")])
+def test_of_velocities_that_are_guessed_only_what_is_certain_counts_unseen(sure, said):
+    """What test runs do not show at all."""
+    seen = {"refit": 0.95, "left": 0.9, "sure": sure}
+    assert verdict(**seen) == "named_partial"
+    assert verdict(**seen, guessed=True) == said
+
+
+@pytest.mark.parametrize(
+    ("refit", "guessed", "said"),
+    [(3.0, False, "unknown"), (3.0, True, "none"), (6.0, True, "unknown")],
+)
+def test_of_velocities_that_are_guessed_only_a_plain_gap_is_one(refit, guessed, said):
+    found = {"refit": refit, "left": 1.5 * refit, "sure": 1e-4, "validation": (refit, refit)}
+    assert verdict(**found, guessed=guessed) == said
 
 
 @pytest.mark.parametrize(("left", "said"), [(11.0, "named_partial"), (23.0, "unknown")])

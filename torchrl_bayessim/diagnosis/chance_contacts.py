@@ -4,8 +4,8 @@ The covariance of a segment's innovations is a linear view at one simulator. At 
 segment may pass an impact that it missed before, and noise of start and sensors then makes of it
 sixty times what the covariance says: on clean data of a running robot half of what is left sits in
 few such segments. So where much is left, a robot is simulated that *is* the simulator, with noise
-of its own, and rows in which its innovations are larger than one are trusted that much less. What
-the simulator lacks noise does not make, and counts as before.
+of its own, and rows in which its innovations are larger than one are trusted that much less, if
+need be as its loudest run. What the simulator lacks noise does not make, and counts as before.
 """
 
 from __future__ import annotations
@@ -57,16 +57,17 @@ def trusted_less(
     loud = np.flatnonzero(squares > _LOUD)
     if not len(loud) or not touches(objective.predictor, objective.segments.qpos):
         return None
-    larger = _made_by_noise(objective.take(loud), point, noise, generator)
+    larger, most = _made_by_noise(objective.take(loud), point, noise, generator)
     chance = larger.mean(1) > _TWICE
-    loud, larger = loud[chance], larger[chance]
+    loud, larger, most = loud[chance], larger[chance], most[chance]
     if not len(loud):
         return None
     less = _scaled(objective, loud, larger)
-    # a few draws do not show how far chance goes: what is louder yet tells no more than noise
-    still = (less.take(loud).unweighted([point])[0] ** 2).mean(-1)
-    less = _scaled(less, loud, np.repeat(np.maximum(still, 1.0)[:, None], larger.shape[1], 1))
-    by_chance = squares[loud] - np.minimum(still, 1.0)
+    # what chance makes varies: up to the loudest draw, a segment tells no more than noise
+    after = (less.take(loud).unweighted([point])[0] ** 2).mean(-1)
+    still = np.clip(after, 1.0, most)
+    less = _scaled(less, loud, np.repeat(still[:, None], larger.shape[1], 1))
+    by_chance = squares[loud] - after / still
     left = np.maximum(squares - 1.0, 0.0).sum()
     if by_chance.sum() <= _PART * left:
         return None
@@ -87,12 +88,18 @@ def _scaled(objective: Objective, segments: NDArray[np.int64], larger: Array) ->
 
 def _made_by_noise(
     objective: Objective, point: Point, noise: Array, generator: np.random.Generator
-) -> Array:
-    """Return how much larger than one squared innovations of noise are, 1 at least, ``(S, K)``."""
+) -> tuple[Array, Array]:
+    """Return how much larger than one squared innovations of noise are.
+
+    Returns:
+        In each row, 1 at least, ``(S, K)``; and the loudest draw of a segment, of those, ``(S,)``.
+    """
     root = start_noise(objective.predictor, objective.segments, noise)
     size = len(objective.segments)
     drawn = np.einsum("dsj,jsn->dsn", generator.standard_normal((_DRAWS, size, len(root))), root)
     moved = objective.raw([point] * _DRAWS, drawn) - objective.raw([point])
     moved += noise * generator.standard_normal(moved.shape)
     white = objective.whitening(moved) / objective.whitening.weights[:, None]
-    return excess((white**2).reshape(*moved.shape))
+    squares = (white**2).reshape(*moved.shape)
+    larger = excess(squares)
+    return larger, np.maximum((squares.mean(-1) / larger).mean(-1).max(0), 1.0)

@@ -191,8 +191,8 @@ def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> S
 def _cost(model: Model, selection: Selection) -> float:
     """Return the criterion, with a price for numbers of laws, and one for a coincidence.
 
-    That all bodies of a robot are heavier in the proportion of their ranges hardly happens: what
-    one cause of another kind does, such as a gain of commands, looks like it.
+    That all bodies of a robot are heavier, or all rotors larger, in the proportion of their ranges
+    hardly happens: what one cause of another kind does, such as a gain of commands, looks like it.
     """
     everywhere = sum(
         unit.effect.group == Armature.group and sum(part != 0 for part in unit.direction) > 1

@@ -161,6 +161,12 @@ def _runs(
     ]
 
 
+def _usual(covariances: torch.Tensor) -> torch.Tensor:
+    """Return the covariance of median size, ``(1, 2 nv, 2 nv)``; a mean is that of a few rows."""
+    sizes = covariances.diagonal(dim1=1, dim2=2).sum(-1)
+    return covariances[sizes.median(0).indices][None]
+
+
 def _played(prepared: Prepared, waves: Sequence[Array], point: Point) -> list[Log]:
     """Return the runs of commands from where the first log began, all simulated at once."""
     first = prepared.logs["train"][0]
@@ -174,7 +180,7 @@ def _played(prepared: Prepared, waves: Sequence[Array], point: Point) -> list[Lo
         qpos=first.qpos[:1].repeat(count, 1),
         qvel=torch.zeros(count, first.qvel.shape[1], dtype=torch.float64),
         first_row=0,
-        uncertainty=None if known is None else known.mean(0, keepdim=True).expand(count, -1, -1),
+        uncertainty=None if known is None else _usual(known).expand(count, -1, -1),
         touching=None,
     )
     logs = [replace(rest, ctrl=torch.from_numpy(wave)) for wave in waves]

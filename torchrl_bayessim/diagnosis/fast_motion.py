@@ -38,10 +38,12 @@ class FastMotion:
     Attributes:
         dofs: Those.
         rate: Rows of the logs, 1/s.
+        share: Of `unknown_forces`; chosen anew for each set of logs where there is none.
     """
 
     dofs: tuple[int, ...]
     rate: float
+    share: float | None = None
 
     def __bool__(self) -> bool:
         return bool(self.dofs)
@@ -53,20 +55,29 @@ class FastMotion:
         deviations = torch.diagonal(found, dim1=1, dim2=2).sqrt().median(0).values[half:]
         worst = max(float(deviations[dof]) for dof in self.dofs)
         return (
-            f"velocities were not logged, and the robot is too fast for {self.rate:.3g} rows a "
-            "second to tell them: they are estimated with the simulator from the positions, within "
-            f"±{worst:.2g} per second"
+            f"the robot is too fast for {self.rate:.3g} rows a second to tell velocities that were "
+            "not logged: they are estimated with the simulator from the positions, within "
+            f"±{worst:.2g} per second, and strengths come out too small if much is wrong"
         )
 
     def require_sure(self, curvature: float) -> None:
         """Accept any curvature: what follows from unsure velocities is as wide, and tells less."""
+
+    def settled(
+        self, predictor: Predictor, logs: Sequence[Log], *, theta: Array, noise: Array
+    ) -> FastMotion:
+        """Return the same with unknown forces as these logs say; see `estimated`."""
+        first = self._first(predictor, logs, noise)
+        share = likeliest_share(predictor, logs, first, theta=theta, noise=noise, rows=_TRIAL)
+        return replace(self, share=share)
 
     def estimated(
         self, predictor: Predictor, logs: Sequence[Log], *, theta: Array, noise: Array
     ) -> list[Log]:
         """Return the logs with estimates of the velocities, and how sure they are.
 
-        As they are where the simulator knows less of a velocity than that it varies.
+        As they are where the simulator knows less of most velocities than that they vary; that is
+        not asked of logs whose unknown forces others said.
 
         Args:
             predictor: Simulates.
@@ -74,9 +85,13 @@ class FastMotion:
             theta: Parameters, shape ``(D,)``.
             noise: Standard deviation of each channel's noise, shape ``(C,)``.
         """
+        chosen = self
+        if self.share is None:
+            chosen = self.settled(predictor, logs, theta=theta, noise=noise)
+        forces = np.repeat(
+            (chosen.share or 0.0) ** 2 * unknown_forces(predictor)[None], len(logs), 0
+        )
         first = self._first(predictor, logs, noise)
-        share = likeliest_share(predictor, logs, first, theta=theta, noise=noise, rows=_TRIAL)
-        forces = np.repeat(share**2 * unknown_forces(predictor)[None], len(logs), 0)
         run = filtered(predictor, logs, first, theta=theta, forces=forces, noise=noise)
         states = smoothed(predictor, run, [len(log) for log in logs])
         surprises = np.stack(run.surprises, -1)
@@ -114,13 +129,15 @@ class FastMotion:
     def _sure(self, logs: Sequence[Log], states: Sequence[Beliefs]) -> bool:
         """Return whether most velocities are known better than that they vary."""
         dofs = list(self.dofs)
-        varying = _varying(logs)[dofs]
         size = states[0].qvel.shape[1]
-        variances = np.concatenate([state.covariance for state in states])
-        known = np.median(np.diagonal(variances, axis1=1, axis2=2), 0)[size:][dofs]
+        each = [
+            np.stack([np.diag(state.covariance[i])[size:] for state in states[: len(log)]])
+            for i, log in enumerate(logs)
+        ]
+        known, varying = np.median(np.concatenate(each), 0)[dofs], _varying(logs)[dofs]
         if not (np.isfinite(known).all() and np.isfinite(varying).all()):
             return False
-        return bool((known < varying**2).mean() > _MOST)
+        return self.share is not None or bool((known < varying**2).mean() > _MOST)
 
 
 def fast_motion(predictor: Predictor, logs: Sequence[Log]) -> FastMotion:
@@ -128,13 +145,14 @@ def fast_motion(predictor: Predictor, logs: Sequence[Log]) -> FastMotion:
 
     Args:
         predictor: Simulates.
-        logs: With the errors that polynomials make, as `with_velocity_errors` gives.
+        logs: With the errors that polynomials make, as `with_velocity_errors` gives: of hinges and
+            slides.
     """
     gain, error = of_velocities(logs)
-    dofs = np.flatnonzero(gain > 0)
-    fast = error[dofs] > _FAST * _varying(logs)[dofs]
-    rate = 1.0 / predictor.system.control_dt
-    return FastMotion(tuple(dofs.tolist()) if fast.sum() > _MOST * len(dofs) else (), rate)
+    told = [dof for dof in predictor.system.robot.dof_index if gain[dof] > 0]
+    fast = error[told] > _FAST * _varying(logs)[told]
+    dofs = np.flatnonzero(gain > 0) if fast.sum() > _MOST * len(told) else []
+    return FastMotion(tuple(int(dof) for dof in dofs), 1.0 / predictor.system.control_dt)
 
 
 def _nearby(surprise: Array) -> Array:

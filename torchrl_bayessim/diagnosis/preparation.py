@@ -235,10 +235,11 @@ def _completed(
         theta = parameters_at(prior, fit.point.z)
         curvature = sets["train"].whitening.curvature
     unseen.require_sure(curvature)
-    found = {
-        name: unseen.estimated(predictor, logs, theta=theta, noise=noise)
-        for name, logs in parts.items()
-    }
+    given = {"theta": theta, "noise": noise}
+    if unseen.estimated(predictor, parts["train"], **given)[0].uncertainty is None:
+        return dict(parts), []
+    unseen = unseen.settled(predictor, parts["train"], **given)
+    found = {name: unseen.estimated(predictor, logs, **given) for name, logs in parts.items()}
     if any(log.uncertainty is None for logs in found.values() for log in logs):
         return dict(parts), []
     return found, [unseen.note(found["train"])]

@@ -87,7 +87,10 @@ def conclude(
         doubts: Why nothing should be named without reserve.
         alpha: Level of the tests.
     """
-    weighed = _Weighed.of(selection, measured, effects, scattered=scattered, alpha=alpha)
+    guessed = prepared.sets["train"].segments.uncertainty is not None
+    weighed = _Weighed.of(
+        selection, measured, effects, scattered=scattered, alpha=alpha, guessed=guessed
+    )
     obstacle = _obstacle(system, prepared, diverges=diverges)
     verdict: Verdict
     if obstacle is not None:
@@ -157,6 +160,7 @@ class _Weighed:
         *,
         scattered: Set[str],
         alpha: float,
+        guessed: bool = False,
     ) -> _Weighed:
         p_value = selection.p_values[0]
         innovations = selection.nominal.fit.innovations, selection.nominal.validation
@@ -165,7 +169,8 @@ class _Weighed:
         least, lowest = min(measured.refit, *others), 1.0 + measured.excess_ci[0]
         shown = least > _UNEXPLAINED or (measured.refit > SHOWN and p_value < SURE)
         shown |= lowest > SHOWN and max(others) > _UNEXPLAINED
-        visible = least > _PLAIN or (lowest > 1.0 and shown)
+        # where segments begin is itself an estimate with this simulator if it was not measured
+        visible = least > _PLAIN or (lowest > 1.0 and shown and not guessed)
         validated = share_on_validation(selection) if effects else 0.0
         # runs that hold little of what chance does say nothing against it, if it is sure
         surely = min((e.p_value for e in effects), default=1.0) < _CERTAIN
@@ -179,6 +184,7 @@ class _Weighed:
         helps &= measured.effects <= _NOISE_AGAIN
         borne_out = certain or measured.effects < measured.refit or validated >= PARTIAL
         found = p_value <= alpha and borne_out and bool(selection.best.units)
+        found &= certain or not guessed
         significant = found or by_chance
         # told as one cause or not: together, laws imitate many a third one nearly
         several = len(effects) > 1 or len(selection.best.names) > 1
@@ -239,6 +245,8 @@ def _excited(system: System, prepared: Prepared) -> bool:
 def _too_fast(prepared: Prepared) -> bool:
     """Return whether most velocities that were not measured are guesses."""
     segments = prepared.sets["train"].segments
-    guessed = segments.velocity_gain > 0
+    guessed = np.zeros(len(segments.velocity_gain), dtype=bool)
+    guessed[list(prepared.predictor.system.robot.dof_index)] = True  # of others no error is known
+    guessed &= segments.velocity_gain > 0
     known = segments.qvel.reshape(-1, segments.qvel.shape[-1]).std(0)
     return bool(guessed.any() and (segments.velocity_error > known)[guessed].mean() > _MOST)
