@@ -27,6 +27,7 @@ _LOUD = 3.0  # mean squared innovation of a segment that is looked at
 _DRAWS = 48
 _TWICE = 2.0  # what the covariance says
 _PART = 0.3  # of what is left beyond noise
+_FEW = 0.5  # of the segments: where more are loud, the simulator lacks something everywhere
 
 
 def left_to_chance(
@@ -45,7 +46,7 @@ def trusted_less(
 ) -> Objective | None:
     """Return the objective with what chance makes of its loud segments.
 
-    Nothing if that is less than a third of what is left beyond noise.
+    Nothing if that is less than a third of what is left beyond noise, or most segments are loud.
 
     Args:
         objective: Segments and their covariance, of one simulator.
@@ -55,7 +56,9 @@ def trusted_less(
     """
     squares = (objective.unweighted([point])[0] ** 2).mean(-1)
     loud = np.flatnonzero(squares > _LOUD)
-    if not len(loud) or not touches(objective.predictor, objective.segments.qpos):
+    if not 0 < len(loud) <= _FEW * len(squares) or not touches(
+        objective.predictor, objective.segments.qpos
+    ):
         return None
     larger, most = _made_by_noise(objective.take(loud), point, noise, generator)
     chance = larger.mean(1) > _TWICE
