@@ -85,13 +85,10 @@ class FastMotion:
             theta: Parameters, shape ``(D,)``.
             noise: Standard deviation of each channel's noise, shape ``(C,)``.
         """
-        chosen = self
-        if self.share is None:
-            chosen = self.settled(predictor, logs, theta=theta, noise=noise)
-        forces = np.repeat(
-            (chosen.share or 0.0) ** 2 * unknown_forces(predictor)[None], len(logs), 0
-        )
-        first = self._first(predictor, logs, noise)
+        first, share = self._first(predictor, logs, noise), self.share
+        if share is None:
+            share = likeliest_share(predictor, logs, first, theta=theta, noise=noise, rows=_TRIAL)
+        forces = np.repeat(share**2 * unknown_forces(predictor)[None], len(logs), 0)
         run = filtered(predictor, logs, first, theta=theta, forces=forces, noise=noise)
         states = smoothed(predictor, run, [len(log) for log in logs])
         surprises = np.stack(run.surprises, -1)

@@ -236,10 +236,14 @@ def _completed(
         curvature = sets["train"].whitening.curvature
     unseen.require_sure(curvature)
     given = {"theta": theta, "noise": noise}
-    if unseen.estimated(predictor, parts["train"], **given)[0].uncertainty is None:
+    train = unseen.estimated(predictor, parts["train"], **given)
+    if train[0].uncertainty is None:
         return dict(parts), []
     unseen = unseen.settled(predictor, parts["train"], **given)
-    found = {name: unseen.estimated(predictor, logs, **given) for name, logs in parts.items()}
+    found = {
+        name: train if name == "train" else unseen.estimated(predictor, logs, **given)
+        for name, logs in parts.items()
+    }
     if any(log.uncertainty is None for logs in found.values() for log in logs):
         return dict(parts), []
     return found, [unseen.note(found["train"])]

@@ -245,8 +245,8 @@ def _excited(system: System, prepared: Prepared) -> bool:
 def _too_fast(prepared: Prepared) -> bool:
     """Return whether most velocities that were not measured are guesses."""
     segments = prepared.sets["train"].segments
-    guessed = np.zeros(len(segments.velocity_gain), dtype=bool)
-    guessed[list(prepared.predictor.system.robot.dof_index)] = True  # of others no error is known
-    guessed &= segments.velocity_gain > 0
+    # of other joints' velocities no error is known
+    robot = prepared.predictor.system.robot
+    guessed = [dof for dof in robot.dof_index if segments.velocity_gain[dof] > 0]
     known = segments.qvel.reshape(-1, segments.qvel.shape[-1]).std(0)
-    return bool(guessed.any() and (segments.velocity_error > known)[guessed].mean() > _MOST)
+    return bool(guessed) and (segments.velocity_error > known)[guessed].mean() > _MOST
