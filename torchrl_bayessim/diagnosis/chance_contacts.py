@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from .contacts import touches
 from .objective import Objective, Point
-from .whitening import excess, start_noise
+from .whitening import excess
 
 Array = NDArray[np.float64]
 _LOUD = 3.0  # mean squared innovation of a segment that is looked at
@@ -97,11 +97,7 @@ def _made_by_noise(
     Returns:
         In each row, 1 at least, ``(S, K)``; and the loudest draw of a segment, of those, ``(S,)``.
     """
-    root = start_noise(objective.predictor, objective.segments, noise)
-    size = len(objective.segments)
-    drawn = np.einsum("dsj,jsn->dsn", generator.standard_normal((_DRAWS, size, len(root))), root)
-    moved = objective.raw([point] * _DRAWS, drawn) - objective.raw([point])
-    moved += noise * generator.standard_normal(moved.shape)
+    moved = objective.made_by_noise(point, noise, draws=_DRAWS, generator=generator)
     white = objective.whitening(moved) / objective.whitening.weights[:, None]
     squares = (white**2).reshape(*moved.shape)
     larger = excess(squares)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 __all__ = ["chosen_horizon"]
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +15,17 @@ from ..logs.log import Log
 from .objective import Objective, Point, Unit, origin, parameters_at
 from .prediction import Predictor
 from .segments import cut_for_fits
-from .whitening import whitening
+from .whitening import drawn_starts, start_noise, whitening
 
 Array = NDArray[np.float64]
-_LADDER = (3, 10, 20, 40, 80, 160)
+_LADDER = (3, 5, 10, 20, 40, 80, 160)
 _LARGEST, _LARGEST_UNSURE = 0.2, 0.4  # of the median log's length
 _UNSURE = 20  # the least where start states were estimated
 _FILTERED = 10  # where the depth of contacts was
 _PROBE = 100  # control steps on which horizons are compared
 _WORTH = 0.2  # nats per effect that a longer horizon must bring
+_BENT, _STRAIGHT = 1.0, 0.5  # second differences per first one: too many, and few enough
+_SURVIVES = 0.9  # of a signature, another draw of the start's noise
 
 
 def chosen_horizon(
@@ -37,34 +40,90 @@ def chosen_horizon(
 
     Chosen on what simulations of the effects would look like, never on the residuals: largest
     ``Σ_e log(1 + λ_e)`` with ``λ_e`` the squared length of the whitened signature at a tenth of the
-    range, as long as second differences stay below first ones. Where start states were estimated,
-    few steps hardly say how a segment began, and nothing else; nor where contacts were.
+    range, as long as second differences stay below first ones, and signatures much the same at
+    another draw of the start's noise: what contacts scramble no fit can follow. Where start states
+    were estimated, few steps hardly say how a segment began, and nothing else; nor where contacts
+    were, unless these many are scrambled.
     """
-    prior = predictor.system.prior
-    z = origin(prior)
-    usual: dict[str, Effect] = {}  # of its forms the first
-    for unit in units:
-        usual.setdefault(unit.name, unit.effect)
-    units = list({u.name: u for u in units if u.effect == usual[u.name]}.values())
     typical = float(np.median([len(log) for log in logs]))
     guessed = any(log.uncertainty is not None for log in logs)
     filtered = any(log.touching is not None for log in logs)
     least = _UNSURE if guessed else _FILTERED if filtered else 0
-    ladder = [steps for steps in _LADDER if steps >= least]
-    best, choice = -np.inf, ladder[0]
+    longest = typical * (_LARGEST_UNSURE if guessed else _LARGEST)
+    units = _one_of_each(units)
+    shown = partial(_shown, predictor, logs, units=units, noise=noise, history=history)
+    best = partial(_best, shown, worth=_WORTH * len(units))
+    choice = best(steps for steps in _LADDER if least <= steps <= longest)
+    if not choice and filtered and not guessed:
+        choice = best(steps for steps in _LADDER if steps < least)
+    return choice or max(least, _LADDER[0])
+
+
+def _one_of_each(units: Sequence[Unit]) -> list[Unit]:
+    """Return each effect, of its forms the first, at the last of its places: usually all."""
+    usual: dict[str, Effect] = {}
+    for unit in units:
+        usual.setdefault(unit.name, unit.effect)
+    return list({u.name: u for u in units if u.effect == usual[u.name]}.values())
+
+
+def _best(shown: Callable[[int], float], ladder: Iterable[int], *, worth: float) -> int:
+    """Return the shortest horizon that no longer one beats by much; 0 if contacts scramble all."""
+    best, choice = -np.inf, 0
     for steps in ladder:
-        if steps > typical * (_LARGEST_UNSURE if guessed else _LARGEST):
+        value = shown(steps)
+        if not np.isfinite(value):
             break
-        pieces = cut_for_fits(logs, steps, history=history, most=max(4, _PROBE // steps))
-        white = whitening(predictor, pieces, parameters_at(prior, z), noise)
-        if white.curvature > 1.0 and np.isfinite(best):
-            break
-        objective = Objective(predictor, prior, pieces, white)
-        points = [Point(z), *(Point(z, {unit: 0.1 * unit.high}) for unit in units)]
-        innovations = objective(points)
-        change = ((innovations[1:] - innovations[0]) ** 2).sum((1, 2))
-        per_row = change * (sum(len(log) for log in logs) / (len(pieces) * steps))
-        value = float(np.log1p(per_row).sum())
-        if value > best + _WORTH * len(units):
+        if value > best + worth:
             best, choice = value, steps
     return choice
+
+
+def _shown(
+    predictor: Predictor,
+    logs: Sequence[Log],
+    steps: int,
+    *,
+    units: Sequence[Unit],
+    noise: Array,
+    history: int,
+) -> float:
+    """Return ``Σ_e log(1 + λ_e)`` over so many steps; minus infinity if contacts scramble it."""
+    prior = predictor.system.prior
+    z = origin(prior)
+    pieces = cut_for_fits(logs, steps, history=history, most=max(4, _PROBE // steps))
+    white = whitening(predictor, pieces, parameters_at(prior, z), noise)
+    if white.curvature > _BENT:
+        return -np.inf
+    objective = Objective(predictor, prior, pieces, white)
+    points = [Point(z), *(Point(z, {unit: 0.1 * unit.high}) for unit in units)]
+    signatures = _signatures(objective, points)
+    if units and white.curvature > _STRAIGHT:
+        root = start_noise(predictor, pieces, noise)
+        other = _signatures(objective, points, drawn_starts(root, 1, np.random.default_rng(0)))
+        if _alike(signatures, other) < _SURVIVES:
+            return -np.inf
+    change = (signatures**2).sum((1, 2))
+    per_row = change * (sum(len(log) for log in logs) / (len(pieces) * steps))
+    return float(np.log1p(per_row).sum())
+
+
+def _signatures(
+    objective: Objective, points: Sequence[Point], offset: Array | None = None
+) -> Array:
+    """Return by how much innovations differ from those of the first point, ``(P - 1, S, KC)``.
+
+    Args:
+        objective: Evaluates.
+        points: The first without effects.
+        offset: Of the start states, ``(1, S, 2 nv)``.
+    """
+    moved = objective(points, None if offset is None else np.repeat(offset, len(points), 0))
+    return moved[1:] - moved[0]
+
+
+def _alike(signatures: Array, others: Array) -> float:
+    """Return the usual correlation of signatures of the same effects."""
+    both = (signatures * others).sum((1, 2))
+    each = (signatures**2).sum((1, 2)) * (others**2).sum((1, 2))
+    return float(np.median(both / np.sqrt(np.maximum(each, 1e-12))))

@@ -28,6 +28,7 @@ _STEPS, _FEWER = 8, 4  # control steps of a segment; where that makes few segmen
 _BEYOND = 3.0  # times its spec, or its like, that a sensor is not noisier than
 _ROUGHLY = 2.0  # times what third differences say
 _LIKE = 3  # sensors of one kind
+_DRAWS = 8  # simulated robots whose noise is known
 
 
 class _Known(NamedTuple):
@@ -91,7 +92,12 @@ def measured_noise(
         at = fit.point
         points = [_pushed(at, unit) for unit in pushes]
         pushed = objective(points) if points else np.zeros((0, *fit.innovations.shape))
-        factor = innovation_noise(fit.innovations, pushed - fit.innovations, len(pieces.checked))
+        factor = innovation_noise(
+            fit.innovations,
+            pushed - fit.innovations,
+            _drawn(objective, at, noise),
+            len(pieces.checked),
+        )
         noise = np.maximum(noise * np.clip(factor, 1 / _AT_ONCE, _AT_ONCE), known.tiny)
         estimate, noise = noise, np.minimum(noise, _most(noise, known, system.robot))
         if np.abs(np.log(np.maximum(factor, 1e-9))).max() < _SETTLED:
@@ -105,6 +111,19 @@ def measured_noise(
         alarms.append(UNCERTAIN + ", estimated against specified: " + ", ".join(apart))
     source = "differences of innovations"
     return noise, source if beside is None else f"{source} beside the effects found first"
+
+
+def _drawn(objective: Objective, point: Point, noise: Array) -> Array:
+    """Return innovations of robots that are the simulator, ``(draws, S, KC)``.
+
+    Where a start was guessed with what it is to predict, of a robot of which the linear view holds:
+    the guess is better than its covariance says, and drawn from that would hide all noise.
+    """
+    generator = np.random.default_rng(0)
+    if objective.segments.uncertainty is not None:
+        return generator.standard_normal((_DRAWS, *objective.whitening.drift.shape))
+    residual = objective.made_by_noise(point, noise, draws=_DRAWS, generator=generator)
+    return objective.whitening(residual)
 
 
 def _pushed(point: Point, push: Unit) -> Point:

@@ -42,7 +42,7 @@ from ..inference.priors import Prior
 from .prediction import Predictor
 from .segments import Segments
 from .strengths import Strengths
-from .whitening import Whitening
+from .whitening import Whitening, drawn_starts, start_noise
 
 Array = NDArray[np.float64]
 
@@ -226,6 +226,22 @@ class Objective:
         share = np.array([point.z[-1] for point in points])
         drift = self.whitening.drift * self.whitening.weights[:, None]
         return self.whitening(self.raw(points, offsets)) - share[:, None, None] * drift
+
+    def made_by_noise(
+        self, point: Point, noise: Array, *, draws: int, generator: np.random.Generator
+    ) -> Array:
+        """Return residuals of simulated robots that are the simulator, ``(draws, S, K, C)``.
+
+        Args:
+            point: The simulator.
+            noise: Standard deviation of each channel's noise, shape ``(C,)``.
+            draws: So many robots.
+            generator: Of their noise.
+        """
+        root = start_noise(self.predictor, self.segments, noise)
+        moved = self.raw([point] * draws, drawn_starts(root, draws, generator))
+        moved -= self.raw([point])
+        return moved + noise * generator.standard_normal(moved.shape)
 
     def unweighted(self, points: Sequence[Point], offsets: Array | None = None) -> Array:
         """Return innovations without the robust weights, shape ``(P, S, KC)``."""

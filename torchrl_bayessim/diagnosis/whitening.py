@@ -19,6 +19,7 @@ from __future__ import annotations
 __all__ = [
     "ENOUGH",
     "Whitening",
+    "drawn_starts",
     "excess",
     "innovation_noise",
     "noise_from_differences",
@@ -134,9 +135,7 @@ def whitening(
     lower = np.linalg.cholesky(spread)
     inverse = np.linalg.inv(lower)
     if generator is not None:
-        drawn = np.einsum(
-            "dsj,jsn->dsn", generator.standard_normal((_DRAWS, size, len(root))), root
-        )
+        drawn = drawn_starts(root, _DRAWS, generator)
         moved = predictor.residuals(segments, np.repeat(theta[None], _DRAWS, 0), None, drawn)
         made = moved - finer - (step / 2).reshape(finer.shape)
         made += noise * generator.standard_normal(moved.shape)
@@ -164,6 +163,12 @@ def excess(squares: Array) -> Array:
     loud = rows > 1.0 + 3.0 * np.sqrt(2.0 / (squares.shape[0] * squares.shape[3]))
     others = np.where(loud, 0.0, rows).sum(1) / np.maximum((~loud).sum(1), 1)
     return np.where(loud, rows, np.maximum(others, 1.0)[:, None])
+
+
+def drawn_starts(root: Array, draws: int, generator: np.random.Generator) -> Array:
+    """Return drawn errors of the start states, ``(draws, S, 2 nv)``; see `start_noise`."""
+    steps, size, _ = root.shape
+    return np.einsum("dsj,jsn->dsn", generator.standard_normal((draws, size, steps)), root)
 
 
 def start_noise(predictor: Predictor, segments: Segments, noise: Array) -> Array:
@@ -231,19 +236,21 @@ def noise_from_differences(logs: Sequence[Log], values: Sequence[Array]) -> Arra
     return spread / np.sqrt(_THIRD_DIFFERENCE)
 
 
-def innovation_noise(innovations: Array, pushes: Array, checks: int) -> Array:
+def innovation_noise(innovations: Array, pushes: Array, drawn: Array, checks: int) -> Array:
     """Return by which factor each channel's noise differs from what was assumed, shape ``(C,)``.
 
-    ``σ̂² = mean ½(ε_{t+1} - ε_t)²`` over innovations in order of time, divided by what unit noise
-    gives in the same way: a model's error is smooth, and so drops out. What a constant force at any
-    joint could explain within the segment is projected out first, since over a few steps a missing
-    force is hardly more than that. The worst tenth of the segments is left out, or, where the worse
-    half of many has more than its part, all but the calmest quarter: noise is the same everywhere,
-    and what a missing effect does, such as an impact where backlash closes, is not.
+    ``σ̂² = mean ½(ε_{t+1} - ε_t)²`` over innovations in order of time, divided by what simulated
+    robots give in the same way, whose noise is known: a model's error is smooth, and so drops out.
+    What a constant force at any joint could explain within the segment is projected out first,
+    since over a few steps a missing force is hardly more than that. The worst tenth of the segments
+    is left out, or, where the worse half of many has more than its part, all but the calmest
+    quarter: noise is the same everywhere, and what a missing effect does, such as an impact where
+    backlash closes, is not.
 
     Args:
         innovations: Shape ``(S, KC)``.
         pushes: What a force at each joint changes, shape ``(J, S, KC)``.
+        drawn: Innovations of the simulated robots, shape ``(draws, S, KC)``.
         checks: Rows per segment, ``K``.
     """
     size, channels = innovations.shape[1], innovations.shape[1] // checks
@@ -257,9 +264,8 @@ def innovation_noise(innovations: Array, pushes: Array, checks: int) -> Array:
         squares = ((rest @ steps.T) ** 2).reshape(len(some), checks - 1, channels).sum(1)
         return np.where(squares <= np.quantile(squares, share, axis=0), squares, 0.0).sum(0)
 
-    noise = np.random.default_rng(0).standard_normal((8, *innovations.shape))
     most, half, calm = (
-        spread(innovations, share) / np.mean([spread(one, share) for one in noise], axis=0)
+        spread(innovations, share) / np.mean([spread(one, share) for one in drawn], axis=0)
         for share in (_MOST, _HALF, _CALM)
     )
     uneven = (most > _UNEVEN * half) & (len(innovations) >= ENOUGH)

@@ -1,0 +1,39 @@
+"""Logs of HalfCheetah, whose noise is known."""
+
+import copy
+
+import mujoco
+import numpy as np
+import torch
+
+from torchrl_bayessim.envs.tasks.catalogue import known_task
+from torchrl_bayessim.logs.log import Log
+from torchrl_bayessim.logs.system import System
+
+
+def cheetah(*, noise=None, stiffness=0.0):
+    """Return HalfCheetah, its logs with a spring at a joint that it does not have, their noise."""
+    task = known_task("HalfCheetah-v5")
+    model, rng, logs = copy.copy(task.model), np.random.default_rng(0), []
+    model.jnt_stiffness[model.joint("bthigh").id] += stiffness
+    true = np.repeat([0.002, 0.02], model.nv)
+    for i in range(4):
+        data, rows, commands = mujoco.MjData(model), [], 0.5 * rng.uniform(-1, 1, (80, model.nu))
+        for u in commands:
+            rows.append(np.r_[data.qpos, data.qvel] + true * rng.standard_normal(2 * model.nv))
+            data.ctrl[:] = u
+            mujoco.mj_step(model, data, task.frame_skip)
+        state = torch.from_numpy(np.array(rows))
+        logs.append(
+            Log(
+                name=f"run{i}",
+                time=task.dt * torch.arange(80).double(),
+                qpos=state[:, : model.nq],
+                qvel=state[:, model.nq :],
+                ctrl=torch.from_numpy(commands),
+                velocity_gain=torch.zeros(model.nv).double(),
+                measured=torch.ones(2 * model.nv, dtype=torch.bool),
+            )
+        )
+    given = {} if noise is None else dict(zip(System(task=task).robot.channels, noise, strict=True))
+    return System(task=task, noise=given), logs, true
