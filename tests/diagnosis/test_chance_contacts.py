@@ -4,6 +4,7 @@ import importlib
 from dataclasses import replace
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -18,6 +19,7 @@ from torchrl_bayessim.diagnosis.refit import refit
 from torchrl_bayessim.diagnosis.segments import cut_for_fits
 from torchrl_bayessim.diagnosis.whitening import whitening
 from torchrl_bayessim.effects.catalogue import effect
+from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.envs.tasks.catalogue import known_task
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.logs.log import Log
@@ -104,6 +106,59 @@ def test_of_what_a_robot_lacks_chancy_segments_keep_what_no_draw_makes(seed, dam
     nothing = trusted_less(clean, point, noise=NOISE, generator=draw())
     assert squares(less, point).mean() > 1.5 * squares(nothing, point).mean()
     assert squares(less, point).max() > 3.0
+
+
+BOXES = """
+<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody>
+  <body name="sled"><joint name="x" type="slide" axis="1 0 0"/>
+    <joint name="y" type="slide" axis="0 1 0"/><geom type="box" size=".05 .05 .05" mass="1"/></body>
+  <body name="block" pos=".11 .1 0"><joint name="block" type="slide" axis="1 0 0"/>
+    <geom type="box" size=".05 .05 .05" mass="1"/></body>
+</worldbody><actuator><motor name="push" joint="x" ctrlrange="-1 1"/></actuator></mujoco>
+"""
+SLED = np.repeat([0.002, 0.002], 3)
+
+
+def sliding(*, true, shown, pushed=0.0):
+    """Return a run whose first segment starts elsewhere across the track than it is shown to."""
+    task = Task(model=mujoco.MjModel.from_xml_string(BOXES), frame_skip=10)
+    data, rows = mujoco.MjData(task.model), []
+    data.qpos[:], data.qvel[:] = [0.0, true, 0.0], [0.1, 0.0, 0.0]
+    for row in range(11):
+        rows.append(np.r_[data.qpos, data.qvel])
+        data.qvel[0] += pushed * (row == 5)
+        mujoco.mj_step(task.model, data, task.frame_skip)
+    state = torch.from_numpy(np.array(rows))
+    state += torch.tensor(SLED) * torch.randn(
+        state.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    state[0] = torch.tensor([0.0, shown, 0.0, 0.1, 0.0, 0.0])
+    return task, Log(
+        name="run",
+        time=task.dt * torch.arange(11).double(),
+        qpos=state[:, :3],
+        qvel=state[:, 3:],
+        ctrl=torch.zeros(11, 1).double(),
+        velocity_gain=torch.zeros(3).double(),
+        measured=torch.ones(6, dtype=torch.bool),
+    )
+
+
+@pytest.mark.parametrize(
+    ("true", "shown", "pushed", "chance"),
+    [(0.0005, -0.0047, 0.0, True), (-0.02, -0.02, 0.1, False), (0.02, -0.02, 0.0, False)],
+    ids=["hit by chance", "pushed", "hit by no chance"],
+)
+def test_a_block_that_is_hit_once_in_hundreds_of_draws(true, shown, pushed, chance):
+    task, log = sliding(true=true, shown=shown, pushed=pushed)
+    logs = [log, *(sliding(true=-0.02, shown=-0.02)[1] for _ in range(3))]
+    predictor = Predictor(System(task=task))
+    segments = cut_for_fits(logs, 10, history=0, most=4)
+    white = whitening(predictor, segments, np.zeros(0), SLED, generator=np.random.default_rng(0))
+    objective, point = Objective(predictor, None, segments, white), Point(np.zeros(1))
+    assert (squares(objective, point) > 3.0).tolist() == [True, False, False, False]
+    less = trusted_less(objective, point, noise=SLED, generator=np.random.default_rng(1))
+    assert (squares(less or objective, point)[0] < 2.0) == chance
 
 
 def test_the_same_noise_is_drawn_for_the_same_seed():

@@ -5,7 +5,9 @@ segment may pass an impact that it missed before, and noise of start and sensors
 sixty times what the covariance says: on clean data of a running robot half of what is left sits in
 few such segments. So where much is left, a robot is simulated that *is* the simulator, with noise
 of its own, and rows in which its innovations are larger than one are trusted that much less, if
-need be as its loudest run. What the simulator lacks noise does not make, and counts as before.
+need be as its loudest run; of the few segments that are louder still a thousand are simulated, as
+an object that a hand just misses may be hit once in so many. What the simulator lacks noise does
+not make, and counts as before.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ from .whitening import excess
 
 Array = NDArray[np.float64]
 _LOUD = 3.0  # mean squared innovation of a segment that is looked at
-_DRAWS = 48
+_DRAWS, _MANY = 48, 1000  # of the noise; where few segments are louder than any draw
+_RARE = 0.05  # of the segments, that few
 _TWICE = 2.0  # what the covariance says
 _PART = 0.3  # of what is left beyond noise
 _FEW = 0.5  # of the segments: where more are loud, the simulator lacks something everywhere
@@ -61,13 +64,17 @@ def trusted_less(
     ):
         return None
     larger, most = _made_by_noise(objective.take(loud), point, noise, generator)
-    chance = larger.mean(1) > _TWICE
+    rare = np.flatnonzero(_after(objective, loud, larger, point) > _LOUD * most)
+    if 0 < len(rare) <= max(1.0, _RARE * len(squares)):
+        few = objective.take(loud[rare])
+        larger[rare], most[rare] = _made_by_noise(few, point, noise, generator, draws=_MANY)
+    chance = (larger.mean(1) > _TWICE) | (most > _LOUD)
     loud, larger, most = loud[chance], larger[chance], most[chance]
     if not len(loud):
         return None
     less = _scaled(objective, loud, larger)
     # what chance makes varies: up to the loudest draw, a segment tells no more than noise
-    after = (less.take(loud).unweighted([point])[0] ** 2).mean(-1)
+    after = _after(objective, loud, larger, point)
     still = np.clip(after, 1.0, most)
     less = _scaled(less, loud, np.repeat(still[:, None], larger.shape[1], 1))
     by_chance = squares[loud] - after / still
@@ -76,6 +83,12 @@ def trusted_less(
         return None
     # what made them loud was why they counted for less: not twice for one reason
     return less if (objective.whitening.weights == 1.0).all() else less.weighted(point)
+
+
+def _after(objective: Objective, segments: NDArray[np.int64], larger: Array, point: Point) -> Array:
+    """Return mean squared innovations of some segments with variances so much larger, ``(S,)``."""
+    less = _scaled(objective, segments, larger).take(segments)
+    return (less.unweighted([point])[0] ** 2).mean(-1)
 
 
 def _scaled(objective: Objective, segments: NDArray[np.int64], larger: Array) -> Objective:
@@ -90,14 +103,19 @@ def _scaled(objective: Objective, segments: NDArray[np.int64], larger: Array) ->
 
 
 def _made_by_noise(
-    objective: Objective, point: Point, noise: Array, generator: np.random.Generator
+    objective: Objective,
+    point: Point,
+    noise: Array,
+    generator: np.random.Generator,
+    *,
+    draws: int = _DRAWS,
 ) -> tuple[Array, Array]:
     """Return how much larger than one squared innovations of noise are.
 
     Returns:
         In each row, 1 at least, ``(S, K)``; and the loudest draw of a segment, of those, ``(S,)``.
     """
-    moved = objective.made_by_noise(point, noise, draws=_DRAWS, generator=generator)
+    moved = objective.made_by_noise(point, noise, draws=draws, generator=generator)
     white = objective.whitening(moved) / objective.whitening.weights[:, None]
     squares = (white**2).reshape(*moved.shape)
     larger = excess(squares)
