@@ -22,10 +22,10 @@ SEEDS = (
     *(2211, 2213, 2214, 2215, 4471, 5083, 9207, 9401, 9402),
     *(9501, 9502, 9503, 9504, 9505, 9506, 9507, 9508, 9509),
     *(9510, 9511, 9512, 9513, 9514, 9515, 9516, 9517, 9518, 9519, 9520),
-    *(9521, 9522, 9523, 9524, 9525, 9527),
+    *(9521, 9522, 9523, 9524, 9525, 9527, 9529),
     *(8801, 8802, 8803, 8901, 8902, 8911, 8912, 8913, 9526, 9528),
 )
-_ROBOTS = "arm", "two_links", "cart_pole", "hopper", "half_cheetah"
+_ROBOTS = "arm", "two_links", "cart_pole", "hopper", "half_cheetah", "fetch_push"
 
 
 def lists(seed: int, robots: Sequence[str], tiers: Mapping[str, int]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from torchrl_bayessim.logs.system import System
 
 
 def cheetah(*, noise=None, stiffness=0.0):
-    """Return HalfCheetah, its logs with a spring at a joint that it does not have, their noise."""
+    """Return HalfCheetah, logs of one with a spring more, and the logs' noise."""
     task = known_task("HalfCheetah-v5")
     model, rng, logs = copy.copy(task.model), np.random.default_rng(0), []
     model.jnt_stiffness[model.joint("bthigh").id] += stiffness

@@ -1,22 +1,61 @@
 """How many control steps a segment has."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from noisy_cheetah import cheetah
 
-from torchrl_bayessim.diagnosis.horizon import chosen_horizon
+from torchrl_bayessim.diagnosis import horizon
 from torchrl_bayessim.diagnosis.objective import units_of
 from torchrl_bayessim.diagnosis.prediction import Predictor
 from torchrl_bayessim.effects.catalogue import CATALOGUE, effect
+from torchrl_bayessim.logs.touching import Touching
+
+SYSTEM, LOGS, NOISE = cheetah()
+UNITS = units_of([effect(name) for name in CATALOGUE], SYSTEM.robot)
 
 
-@pytest.mark.parametrize(("noisier", "steps"), [(3.0, 5), (10.0, 3)])
-def test_no_longer_than_a_signature_survives_the_noise_of_the_start(noisier, steps):
+def chosen(logs=LOGS, *, noisier=1.0):
+    units = [unit for unit in UNITS if not unit.effect.random]
+    return horizon.chosen_horizon(
+        Predictor(SYSTEM), logs, units=units, noise=noisier * NOISE, history=8
+    )
+
+
+def test_no_longer_than_a_signature_survives_the_noise_of_the_start(monkeypatch):
     """At ten times the noise a foot comes down in another row, and all after it is another."""
-    system, logs, noise = cheetah()
-    units = [
-        u
-        for u in units_of([effect(name) for name in CATALOGUE], system.robot)
-        if not u.effect.random
+    assert chosen(noisier=10.0) == 3
+    monkeypatch.setattr(horizon, "_alike", lambda *_: 1.0)
+    assert chosen(noisier=10.0) > 3
+
+
+def settled(rows):
+    """Return the logs as far as that, as if contacts had said something of their starts."""
+    size = 2 * SYSTEM.task.model.nv
+    free = np.broadcast_to(np.eye(size), (rows, size, size))
+    nothing = Touching(np.zeros((rows, size)), free, np.zeros((rows, size, size)))
+    return [
+        replace(
+            log,
+            time=log.time[:rows],
+            qpos=log.qpos[:rows],
+            qvel=log.qvel[:rows],
+            ctrl=log.ctrl[:rows],
+            touching=nothing,
+        )
+        for log in LOGS
     ]
-    found = chosen_horizon(Predictor(system), logs, units=units, noise=noisier * noise, history=8)
-    assert found == steps
+
+
+@pytest.mark.parametrize(
+    ("rows", "noisier", "steps"), [(80, 1.0, 10), (80, 10.0, 3), (40, 1.0, 10)]
+)
+def test_where_contacts_were_filtered_fewer_steps_only_if_ten_are_scrambled(rows, noisier, steps):
+    assert chosen(settled(rows), noisier=noisier) == steps
+
+
+def test_effects_that_do_not_show_are_not_scrambled():
+    nothing, loud = (np.full((3, 4, 6), value) for value in (1e-6, 2.0))
+    assert horizon._alike(nothing, -nothing) == 1.0
+    assert horizon._alike(loud, -loud) == pytest.approx(-1.0)

@@ -5,9 +5,9 @@ segment may pass an impact that it missed before, and noise of start and sensors
 sixty times what the covariance says: on clean data of a running robot half of what is left sits in
 few such segments. So where much is left, a robot is simulated that *is* the simulator, with noise
 of its own, and rows in which its innovations are larger than one are trusted that much less, if
-need be as its loudest run; of the few segments that are louder still a thousand are simulated, as
-an object that a hand just misses may be hit once in so many. What the simulator lacks noise does
-not make, and counts as before.
+need be as its loudest run. Of a few segments that are louder than any of those runs a thousand are
+simulated: an object that a hand just misses may be hit in one of so many. What the simulator lacks
+noise does not make, and counts as before.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from .whitening import excess
 
 Array = NDArray[np.float64]
 _LOUD = 3.0  # mean squared innovation of a segment that is looked at
-_DRAWS, _MANY = 48, 1000  # of the noise; where few segments are louder than any draw
-_RARE = 0.05  # of the segments, that few
+_DRAWS, _MANY = 48, 1000  # of the noise; of segments that are louder than any of those
+_BEYOND = 3.0  # times its loudest draw that such a segment is
+_RARE = 0.05  # of the segments, one at least: where more are, it is no chance
 _TWICE = 2.0  # what the covariance says
 _PART = 0.3  # of what is left beyond noise
 _FEW = 0.5  # of the segments: where more are loud, the simulator lacks something everywhere
@@ -50,6 +51,7 @@ def trusted_less(
     """Return the objective with what chance makes of its loud segments.
 
     Nothing if that is less than a third of what is left beyond noise, or most segments are loud.
+    The generator is drawn from twice where a few segments are louder than any draw.
 
     Args:
         objective: Segments and their covariance, of one simulator.
@@ -64,11 +66,13 @@ def trusted_less(
     ):
         return None
     larger, most = _made_by_noise(objective.take(loud), point, noise, generator)
-    rare = np.flatnonzero(_after(objective, loud, larger, point) > _LOUD * most)
+    chance = larger.mean(1) > _TWICE
+    rare = np.flatnonzero(_after(objective, loud, larger, point) > _BEYOND * most)
     if 0 < len(rare) <= max(1.0, _RARE * len(squares)):
         few = objective.take(loud[rare])
         larger[rare], most[rare] = _made_by_noise(few, point, noise, generator, draws=_MANY)
-    chance = (larger.mean(1) > _TWICE) | (most > _LOUD)
+        # all or nothing: the loudest of a thousand draws is loud without a reason, too
+        chance[rare] = _after(objective, loud, larger, point)[rare] <= _TWICE * most[rare]
     loud, larger, most = loud[chance], larger[chance], most[chance]
     if not len(loud):
         return None
@@ -87,7 +91,8 @@ def trusted_less(
 
 def _after(objective: Objective, segments: NDArray[np.int64], larger: Array, point: Point) -> Array:
     """Return mean squared innovations of some segments with variances so much larger, ``(S,)``."""
-    less = _scaled(objective, segments, larger).take(segments)
+    some = objective.take(segments)
+    less = _scaled(some, np.arange(len(segments)), larger)
     return (less.unweighted([point])[0] ** 2).mean(-1)
 
 
@@ -118,5 +123,7 @@ def _made_by_noise(
     moved = objective.made_by_noise(point, noise, draws=draws, generator=generator)
     white = objective.whitening(moved) / objective.whitening.weights[:, None]
     squares = (white**2).reshape(*moved.shape)
+    # what diverges says nothing of how loud noise is
+    squares[~np.isfinite(moved).all((2, 3))] = 1.0
     larger = excess(squares)
     return larger, np.maximum((squares.mean(-1) / larger).mean(-1).max(0), 1.0)

@@ -53,9 +53,11 @@ def chosen_horizon(
     units = _one_of_each(units)
     shown = partial(_shown, predictor, logs, units=units, noise=noise, history=history)
     best = partial(_best, shown, worth=_WORTH * len(units))
-    choice = best(steps for steps in _LADDER if least <= steps <= longest)
-    if not choice and filtered and not guessed:
-        choice = best(steps for steps in _LADDER if steps < least)
+    ladder = [steps for steps in _LADDER if steps <= longest]
+    enough = [steps for steps in ladder if steps >= least]
+    choice = best(enough)
+    if enough and not choice and filtered and not guessed:
+        choice = best(steps for steps in ladder if steps < least)
     return choice or max(least, _LADDER[0])
 
 
@@ -68,7 +70,7 @@ def _one_of_each(units: Sequence[Unit]) -> list[Unit]:
 
 
 def _best(shown: Callable[[int], float], ladder: Iterable[int], *, worth: float) -> int:
-    """Return the shortest horizon that no longer one beats by much; 0 if contacts scramble all."""
+    """Return the shortest horizon that no longer one beats by much; 0 if the first is scrambled."""
     best, choice = -np.inf, 0
     for steps in ladder:
         value = shown(steps)
@@ -98,7 +100,8 @@ def _shown(
     objective = Objective(predictor, prior, pieces, white)
     points = [Point(z), *(Point(z, {unit: 0.1 * unit.high}) for unit in units)]
     signatures = _signatures(objective, points)
-    if units and white.curvature > _STRAIGHT:
+    # a guessed start is surer than its covariance says, so draws of that would scramble too much
+    if white.curvature > _STRAIGHT and pieces.uncertainty is None:
         root = start_noise(predictor, pieces, noise)
         other = _signatures(objective, points, drawn_starts(root, 1, np.random.default_rng(0)))
         if _alike(signatures, other) < _SURVIVES:
@@ -123,7 +126,10 @@ def _signatures(
 
 
 def _alike(signatures: Array, others: Array) -> float:
-    """Return the usual correlation of signatures of the same effects."""
-    both = (signatures * others).sum((1, 2))
-    each = (signatures**2).sum((1, 2)) * (others**2).sum((1, 2))
-    return float(np.median(both / np.sqrt(np.maximum(each, 1e-12))))
+    """Return the usual correlation of signatures of the same effects; 1 where none shows."""
+    one, other = (np.sqrt((some**2).sum((1, 2))) for some in (signatures, others))
+    seen = np.minimum(one, other) > 1.0  # noise
+    if not seen.any():
+        return 1.0
+    both = (signatures * others).sum((1, 2))[seen]
+    return float(np.median(both / (one * other)[seen]))

@@ -114,16 +114,19 @@ def measured_noise(
 
 
 def _drawn(objective: Objective, point: Point, noise: Array) -> Array:
-    """Return innovations of robots that are the simulator, ``(draws, S, KC)``.
+    """Return innovations that noise alone would leave, ``(draws, S, KC)``.
 
-    Where a start was guessed with what it is to predict, of a robot of which the linear view holds:
-    the guess is better than its covariance says, and drawn from that would hide all noise.
+    Where a start was estimated from the rows that it is to predict, unit noise: the estimate is
+    better than its covariance says, and draws from that would make all noise look small. So where a
+    simulation diverged.
     """
     generator = np.random.default_rng(0)
+    unit = generator.standard_normal((_DRAWS, *objective.whitening.drift.shape))
     if objective.segments.uncertainty is not None:
-        return generator.standard_normal((_DRAWS, *objective.whitening.drift.shape))
+        return unit
     residual = objective.made_by_noise(point, noise, draws=_DRAWS, generator=generator)
-    return objective.whitening(residual)
+    finite = np.isfinite(residual.reshape(*unit.shape)).all(-1, keepdims=True)
+    return np.where(finite, objective.whitening(residual), unit)
 
 
 def _pushed(point: Point, push: Unit) -> Point:

@@ -230,13 +230,13 @@ class Objective:
     def made_by_noise(
         self, point: Point, noise: Array, *, draws: int, generator: np.random.Generator
     ) -> Array:
-        """Return residuals of simulated robots that are the simulator, ``(draws, S, K, C)``.
+        """Return residuals that noise alone would leave at a point, ``(draws, S, K, C)``.
 
         Args:
             point: The simulator.
             noise: Standard deviation of each channel's noise, shape ``(C,)``.
-            draws: So many robots.
-            generator: Of their noise.
+            draws: So many times.
+            generator: Of the noise, of starts and sensors.
         """
         root = start_noise(self.predictor, self.segments, noise)
         moved = self.raw([point] * draws, drawn_starts(root, draws, generator))
