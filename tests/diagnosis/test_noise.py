@@ -33,6 +33,13 @@ def test_white_noise_has_its_own_size():
     assert (found.std(0) / [0.5, 2.0]).max() < 0.08
 
 
+@pytest.mark.parametrize(("louder", "factor"), [(1.05, 1.0), (1.5, 1 / 1.5)])
+def test_noise_that_the_linear_view_misses_is_that_of_simulated_robots(louder, factor):
+    """By far, that is: by a little they err themselves."""
+    found = [innovation_noise(white(s), NONE, louder * DRAWN, ROWS) for s in range(1, 21)]
+    assert np.mean(found, 0) == pytest.approx([factor, factor], rel=0.03)
+
+
 def test_what_is_smooth_is_no_noise():
     ramp = np.linspace(0.0, 3.0, ROWS)[:, None].repeat(CHANNELS, 1).ravel()
     found = estimates(lambda innovations, _: innovations + ramp)
