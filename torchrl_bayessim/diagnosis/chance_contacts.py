@@ -72,7 +72,8 @@ def trusted_less(
         few = objective.take(loud[rare])
         larger[rare], most[rare] = _made_by_noise(few, point, noise, generator, draws=_MANY)
         # all or nothing: the loudest of a thousand draws is loud without a reason, too
-        chance[rare] = _after(objective, loud, larger, point)[rare] <= _TWICE * most[rare]
+        again = _after(objective, loud[rare], larger[rare], point)
+        chance[rare] = again <= _TWICE * most[rare]
     loud, larger, most = loud[chance], larger[chance], most[chance]
     if not len(loud):
         return None
