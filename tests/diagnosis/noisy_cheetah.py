@@ -11,14 +11,18 @@ from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.system import System
 
 
-def cheetah(*, noise=None, stiffness=0.0):
+def cheetah(*, noise=None, stiffness=0.0, amplitude=0.5, scale=1.0, seed=0):
     """Return HalfCheetah, logs of one with a spring more, and the logs' noise."""
     task = known_task("HalfCheetah-v5")
-    model, rng, logs = copy.copy(task.model), np.random.default_rng(0), []
+    model, rng, logs = copy.copy(task.model), np.random.default_rng(seed), []
     model.jnt_stiffness[model.joint("bthigh").id] += stiffness
-    true = np.repeat([0.002, 0.02], model.nv)
+    true = scale * np.repeat([0.002, 0.02], model.nv)
     for i in range(4):
-        data, rows, commands = mujoco.MjData(model), [], 0.5 * rng.uniform(-1, 1, (80, model.nu))
+        data, rows, commands = (
+            mujoco.MjData(model),
+            [],
+            amplitude * rng.uniform(-1, 1, (80, model.nu)),
+        )
         for u in commands:
             rows.append(np.r_[data.qpos, data.qvel] + true * rng.standard_normal(2 * model.nv))
             data.ctrl[:] = u

@@ -29,6 +29,7 @@ _BEYOND = 3.0  # times its spec, or its like, that a sensor is not noisier than
 _ROUGHLY = 2.0  # times what third differences say
 _LIKE = 3  # sensors of one kind
 _DRAWS = 8  # simulated robots whose noise is known
+_MISSED, _MOST_MISSED = 1.1, 1.6  # factors by which it is found too large: worth it, and believed
 
 
 class _Known(NamedTuple):
@@ -92,16 +93,14 @@ def measured_noise(
         at = fit.point
         points = [_pushed(at, unit) for unit in pushes]
         pushed = objective(points) if points else np.zeros((0, *fit.innovations.shape))
-        factor = innovation_noise(
-            fit.innovations,
-            pushed - fit.innovations,
-            _drawn(objective, at, noise),
-            len(pieces.checked),
-        )
+        pushed -= fit.innovations
+        factor = innovation_noise(fit.innovations, pushed, len(pieces.checked))
         noise = np.maximum(noise * np.clip(factor, 1 / _AT_ONCE, _AT_ONCE), known.tiny)
         estimate, noise = noise, np.minimum(noise, _most(noise, known, system.robot))
         if np.abs(np.log(np.maximum(factor, 1e-9))).max() < _SETTLED:
             break
+    noise = _without_chance(noise, known, _missed(objective, at, pushed, noise=noise))
+    noise = np.minimum(noise, _most(noise, known, system.robot))
     apart = [
         f"{name}: {estimate:.3g} against {spec:.3g}"
         for name, estimate, spec in zip(system.robot.channels, estimate, known.given, strict=True)
@@ -113,20 +112,28 @@ def measured_noise(
     return noise, source if beside is None else f"{source} beside the effects found first"
 
 
-def _drawn(objective: Objective, point: Point, noise: Array) -> Array:
-    """Return innovations that noise alone would leave, ``(draws, S, KC)``.
+def _missed(objective: Objective, point: Point, pushed: Array, *, noise: Array) -> Array:
+    """Return how much too large noise is found on simulated robots, where it is known, ``(C,)``.
 
-    Where a start was estimated from the rows that it is to predict, unit noise: the estimate is
-    better than its covariance says, and draws from that would make all noise look small. So where a
-    simulation diverged.
+    One where starts were estimated from the rows that they are to predict: such an estimate is
+    better than its covariance says, and draws from that would make all noise look small.
     """
-    generator = np.random.default_rng(0)
-    unit = generator.standard_normal((_DRAWS, *objective.whitening.drift.shape))
     if objective.segments.uncertainty is not None:
-        return unit
-    residual = objective.made_by_noise(point, noise, draws=_DRAWS, generator=generator)
-    finite = np.isfinite(residual.reshape(*unit.shape)).all(-1, keepdims=True)
-    return np.where(finite, objective.whitening(residual), unit)
+        return np.ones_like(noise)
+    drawn = objective.made_by_noise(point, noise, draws=_DRAWS, generator=np.random.default_rng(0))
+    checks = len(objective.segments.checked)
+    found = [innovation_noise(one, pushed, checks) for one in objective.whitening(drawn)]
+    return np.median(found, axis=0)
+
+
+def _without_chance(noise: Array, known: _Known, missed: Array) -> Array:
+    """Return noise without what the linear view of it misses: what contacts make of it.
+
+    At most so much that a sensor is as good as its spec, if there is one. A robot that is simulated
+    from a measured start has twice its noise: a foot is deeper in the ground, and more is missed.
+    """
+    less = noise / np.clip(np.where(missed > _MISSED, missed, 1.0), 1.0, _MOST_MISSED)
+    return np.where(known.given > 0, np.maximum(less, np.minimum(noise, known.given)), less)
 
 
 def _pushed(point: Point, push: Unit) -> Point:
