@@ -94,7 +94,9 @@ def _shown(
     prior = predictor.system.prior
     z = origin(prior)
     pieces = cut_for_fits(logs, steps, history=history, most=max(4, _PROBE // steps))
-    white = whitening(predictor, pieces, parameters_at(prior, z), noise)
+    # what contacts make of the start's noise tells nothing of effects
+    generator = np.random.default_rng(0) if predictor.colliding else None
+    white = whitening(predictor, pieces, parameters_at(prior, z), noise, generator=generator)
     if white.curvature > _BENT:
         return -np.inf
     objective = Objective(predictor, prior, pieces, white)
