@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["excess", "location", "missing_force", "signature_curves"]
+__all__ = ["excess", "location", "signature_curves"]
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .objective import Objective, Point, Unit
+from .missing_force import missing_forces
+from .objective import Objective, Unit
 from .refit import Fit
 from .regimes import features, regimes
 from .screening import Screen
@@ -139,7 +140,7 @@ def signature_curves(objective: Objective, fit: Fit, pushes: list[Unit]) -> dict
     """
     if not pushes:
         return {}
-    force, _ = missing_force(objective, fit.point, pushes)
+    (force, _), _ = missing_forces(objective, fit.point, pushes)
     segments, robot = objective.segments, objective.predictor.system.robot
     middle = segments.history + segments.horizon // 2
     curves: dict[str, Any] = {}
@@ -157,28 +158,3 @@ def signature_curves(objective: Objective, fit: Fit, pushes: list[Unit]) -> dict
             name: {"x": x.tolist(), "force": force[:, i].tolist()} for name, x in against.items()
         }
     return curves
-
-
-def missing_force(
-    objective: Objective, point: Point, pushes: Sequence[Unit]
-) -> tuple[Array, Array]:
-    """Return the constant forces that explain most of each segment's residual, and their variances.
-
-    Shapes ``(S, J)``. About contacts the variances differ a thousandfold: a foot in the air shows
-    a force that the same foot on the ground hides.
-
-    Args:
-        objective: Segments and whitening.
-        point: What is in the model already.
-        pushes: A constant force at each of ``J`` joints.
-    """
-    sizes = [0.05 * unit.high for unit in pushes]
-    points = [Point(point.z, {**point.strengths, u: s}) for u, s in zip(pushes, sizes, strict=True)]
-    innovations, *changed = objective([point, *points])
-    slopes = (np.stack(changed) - innovations) / np.array(sizes)[:, None, None]
-    normal = np.einsum("ism,jsm->sij", slopes, slopes)
-    ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12
-    right = -np.einsum("ism,sm->si", slopes, innovations)
-    covariance = np.linalg.inv(normal + ridge * np.eye(len(pushes)))
-    forces = np.einsum("sij,sj->si", covariance, right)
-    return forces, np.diagonal(covariance, axis1=1, axis2=2)

@@ -85,8 +85,8 @@ def measured_noise(
     pieces = _pieces(logs, history=history)
     pushes = pushes_of(system.robot)
     at, noise = beside or (Point(origin(system.prior)), known.assumed)
-    estimate = noise
-    for _ in range(_ROUNDS):
+    estimate, missed = noise, np.ones_like(noise)
+    for rounds in range(1, _ROUNDS + 1):
         white = whitening(predictor, pieces, parameters_at(system.prior, at.z), noise)
         objective = Objective(predictor, system.prior, pieces, white)
         fit = refit(objective, [at], iterations=4)[0]
@@ -97,9 +97,11 @@ def measured_noise(
         factor = innovation_noise(fit.innovations, pushed, len(pieces.checked))
         noise = np.maximum(noise * np.clip(factor, 1 / _AT_ONCE, _AT_ONCE), known.tiny)
         estimate, noise = noise, np.minimum(noise, _most(noise, known, system.robot))
-        if np.abs(np.log(np.maximum(factor, 1e-9))).max() < _SETTLED:
+        settled = np.abs(np.log(np.maximum(factor, 1e-9))).max() < _SETTLED
+        if settled or rounds == _ROUNDS:
+            missed = _missed(objective, at, pushed, noise=noise)
             break
-    noise = _without_chance(noise, known, _missed(objective, at, pushed, noise=noise))
+    noise = _without_chance(noise, known, missed)
     noise = np.minimum(noise, _most(noise, known, system.robot))
     apart = [
         f"{name}: {estimate:.3g} against {spec:.3g}"

@@ -3,10 +3,11 @@
 A periodic disturbance ``s sin(2πft + φ)`` and cogging ``s sin(kq + φ)`` each have two numbers
 beside their strength, which no screen at fixed values can find. Over a few steps a missing force is
 nearly constant, so its course is estimated first, one value per short segment and joint, and the
-best sine over time and over position is fitted to it. Segments begin at every half of their length,
-so that a fast sine is not taken for a slow one which is the same in every segment. So is fitted
-what rounding the recorded commands would have taken away or added, since signatures of two steps
-that differ a little have nothing in common.
+best sine over time and over position is fitted to it: to the force that is missing beside those of
+other joints, and to the one that alone would explain most (see `missing_force`). Segments begin at
+every half of their length, so that a fast sine is not taken for a slow one which is the same in
+every segment. So is fitted what rounding the recorded commands would have taken away or added,
+since signatures of two steps that differ a little have nothing in common.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from ..effects.disturbance import Cogging, PeriodicDisturbance
 from ..effects.effect import Effect
 from ..effects.units import slides
 from ..logs.log import Log
-from .location import missing_force
+from .missing_force import Forces, missing_forces
 from .objective import Objective, Point, Unit, parameters_at, units_of
 from .prediction import Predictor
 from .screening import LEVELS
@@ -35,12 +36,14 @@ from .whitening import whitening
 
 Array = NDArray[np.float64]
 SHAPED = (PeriodicDisturbance.name, Cogging.name, ActionQuantization.name)
-_STEPS = 6  # control steps over which a force is taken to be constant
+_STEPS, _FEWEST_STEPS = 6, 3  # control steps over which a force is taken to be constant
+_SECONDS = 0.12  # the same, where that many are not too few
 _BEFORE = 8  # control steps that effects remember
 _MOST = 400  # segments
 _SLOWEST = 0.5  # cycles per log: slower ones are trends
 _FASTEST = 0.75  # cycles per segment, of which the mean is a third of the largest force
 _FEWEST, _NUMBERS = 2.0, 25.0  # cogs per turn; one is gravity's
+_SAME = 1.5  # steps between rates that are tried: the same one
 _CLEAR = 0.1  # share of the force's variance that a sine or a step must explain
 _ALIKE = 0.1  # of the median variance of forces
 _FINEST, _GRID = 0.02, 600  # of the largest step that is plausible; steps tried
@@ -59,34 +62,29 @@ def shaped(
         pushes: A constant force at each joint.
     """
     history = _BEFORE if point.strengths else 1
-    logs = [log for log in logs if len(log) > max(2 * _STEPS, history + _STEPS)]
+    system = predictor.system
+    steps = int(np.clip(round(_SECONDS / system.control_dt), _FEWEST_STEPS, _STEPS))
+    logs = [log for log in logs if len(log) > max(2 * steps, history + steps)]
     if not pushes or not logs:
         return []
-    system = predictor.system
-    force, weight, time, qpos, ctrl = _missing(
-        predictor, logs, point=point, noise=noise, pushes=pushes, history=history
+    ways, time, qpos, ctrl = _missing(
+        predictor, logs, point=point, noise=noise, pushes=pushes, history=history, steps=steps
     )
     span = float(np.mean([len(log) for log in logs])) * system.control_dt
-    fastest = _FASTEST / (_STEPS * system.control_dt)
+    fastest = _FASTEST / (steps * system.control_dt)
     frequencies = np.arange(_SLOWEST / span, fastest, 0.125 / span)
     units: list[Unit] = []
     for i, push in enumerate(pushes):
         joint = push.joint(system.robot)
         positions = qpos[..., system.robot.qpos_index[joint]]
+        numbers = (_waves if slides(system.robot, joint) else _numbers)(positions)
         found: list[Effect] = []
-        seen = force[:, i], weight[:, i]
-        best = _sine(*seen, 2 * np.pi * time, frequencies)
-        if best is not None:
-            found.append(PeriodicDisturbance(frequency=best[0], phase=best[1]))
-        rates = (_waves if slides(system.robot, joint) else _numbers)(positions)
-        middle = positions[:, _STEPS // 2]
-        best = _sine(*seen, middle, rates)
-        if best is not None:
-            found.append(Cogging(number=best[0], phase=best[1]))
-            if best[0] * np.ptp(positions) < 2 * np.pi:
-                best = _sine(*seen, middle, rates, offset=False)
-                found += [] if best is None else [Cogging(number=best[0], phase=best[1])]
+        for force, weight in ways:
+            seen = force[:, i], weight[:, i]
+            found += _waving(*seen, time, frequencies, there=found)
+            found += _cogging(*seen, positions, numbers, there=found)
         units += [u for u in units_of(found, system.robot) if u.where == push.where]
+    force, weight = ways[0]
     for unit in units_of([ActionQuantization()], system.robot):
         joint, actuator = unit.joint(system.robot), unit.direction.index(1.0)
         column = next((i for i, p in enumerate(pushes) if p.joint(system.robot) == joint), None)
@@ -96,6 +94,39 @@ def shaped(
         if step is not None:
             units.append(at_step(unit, step))
     return units
+
+
+def _waving(
+    force: Array, weight: Array, time: Array, frequencies: Array, *, there: Sequence[Effect]
+) -> list[Effect]:
+    """Return the periodic disturbance that stands out, if it is another than those there are."""
+    best = _sine(force, weight, 2 * np.pi * time, frequencies)
+    others = [e.frequency for e in there if isinstance(e, PeriodicDisturbance)]
+    if best is None or _known(best[0], others, frequencies):
+        return []
+    return [PeriodicDisturbance(frequency=best[0], phase=best[1])]
+
+
+def _cogging(
+    force: Array, weight: Array, positions: Array, numbers: Array, *, there: Sequence[Effect]
+) -> list[Effect]:
+    """Return the cogging that stands out, beside a constant or as part of a wave, if it is new."""
+    middle = positions[:, positions.shape[1] // 2]
+    others = [e.number for e in there if isinstance(e, Cogging)]
+    best = _sine(force, weight, middle, numbers)
+    if best is None or _known(best[0], others, numbers):
+        return []
+    found: list[Effect] = [Cogging(number=best[0], phase=best[1])]
+    if best[0] * np.ptp(positions) < 2 * np.pi:
+        best = _sine(force, weight, middle, numbers, offset=False)
+        found += [] if best is None else [Cogging(number=best[0], phase=best[1])]
+    return found
+
+
+def _known(rate: float, others: Sequence[float], rates: Array) -> bool:
+    """Return whether a rate is one of others, or next to it among those that are tried."""
+    apart = float(rates[1] - rates[0]) if len(rates) > 1 else 0.0
+    return any(abs(rate - other) < _SAME * apart for other in others)
 
 
 def at_step(unit: Unit, step: float) -> Unit:
@@ -111,32 +142,37 @@ def _missing(
     noise: Array,
     pushes: Sequence[Unit],
     history: int,
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return missing forces of short segments, how sure each is, times, positions and commands.
+    steps: int,
+) -> tuple[tuple[tuple[Array, Array], tuple[Array, Array]], Array, Array, Array]:
+    """Return missing forces of short segments with their weights, together and each alone.
 
-    Forces and their weights have shape ``(S, J)``.
+    Of shape ``(S, J)``. And times, positions and commands.
     """
-    half = _STEPS // 2
+    half = steps // 2
     shifted = [stretch(log, half, len(log)) for log in logs]
-    shifted = [log for log in shifted if len(log) > history + _STEPS]
-    forces, variances, seen = [], [], []
+    shifted = [log for log in shifted if len(log) > history + steps]
+    ways: list[tuple[Forces, Forces]] = []
+    seen = []
     for some in [logs, shifted] if shifted else [logs]:
-        pieces = cut(some, _STEPS, history=history, most=_MOST // 2)
+        pieces = cut(some, steps, history=history, most=_MOST // 2)
         prior = predictor.system.prior
         white = whitening(predictor, pieces, parameters_at(prior, point.z), noise)
         objective = Objective(predictor, prior, pieces, white)
-        for part, found in zip(
-            (forces, variances), missing_force(objective, point, pushes), strict=True
-        ):
-            part.append(found)
+        ways.append(missing_forces(objective, point, pushes))
         begin = pieces.history
-        window = slice(begin, begin + _STEPS)
+        window = slice(begin, begin + steps)
         seen.append((pieces.time[:, begin + half], pieces.qpos[:, window], pieces.ctrl[:, window]))
     time, qpos, ctrl = (np.concatenate(part) for part in zip(*seen, strict=True))
-    variance = np.concatenate(variances)
+    together, alone = (_weighed(way) for way in zip(*ways, strict=True))
+    return (together, alone), time, qpos, ctrl
+
+
+def _weighed(parts: Sequence[Forces]) -> tuple[Array, Array]:
+    """Return the forces of several sets of segments, and how much each counts."""
+    forces, variances = (np.concatenate(part) for part in zip(*parts, strict=True))
     # what is wrong beside a constant force errs too, by no more where a force shows best
-    weight = 1.0 / (variance + _ALIKE * np.median(variance, axis=0))
-    return np.concatenate(forces), weight / weight.mean(0), time, qpos, ctrl
+    weight = 1.0 / (variances + _ALIKE * np.median(variances, axis=0))
+    return forces, weight / weight.mean(0)
 
 
 def with_shapes(units: Sequence[Unit], found: Sequence[Unit]) -> list[Unit]:
