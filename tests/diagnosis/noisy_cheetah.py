@@ -11,21 +11,24 @@ from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.system import System
 
 
-def cheetah(*, noise=None, stiffness=0.0, amplitude=0.5, scale=1.0, seed=0):
-    """Return HalfCheetah, logs of one with a spring more, and the logs' noise."""
+def cheetah(*, noise=None, stiffness=0.0, amplitude=0.5, lost=0.0, runs=4, seed=0):
+    """Return HalfCheetah, logs of one with a spring more, and the logs' noise.
+
+    Or of one that loses commands of its back shin.
+    """
     task = known_task("HalfCheetah-v5")
     model, rng, logs = copy.copy(task.model), np.random.default_rng(seed), []
     model.jnt_stiffness[model.joint("bthigh").id] += stiffness
-    true = scale * np.repeat([0.002, 0.02], model.nv)
-    for i in range(4):
-        data, rows, commands = (
-            mujoco.MjData(model),
-            [],
-            amplitude * rng.uniform(-1, 1, (80, model.nu)),
-        )
+    true = np.repeat([0.002, 0.02], model.nv)
+    for i in range(runs):
+        data, rows = mujoco.MjData(model), []
+        commands = amplitude * rng.uniform(-1, 1, (80, model.nu))
         for u in commands:
             rows.append(np.r_[data.qpos, data.qvel] + true * rng.standard_normal(2 * model.nv))
+            held = data.ctrl[1]
             data.ctrl[:] = u
+            if lost and rng.random() < lost:
+                data.ctrl[1] = held
             mujoco.mj_step(model, data, task.frame_skip)
         state = torch.from_numpy(np.array(rows))
         logs.append(

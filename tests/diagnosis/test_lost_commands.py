@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from noisy_cheetah import cheetah
 from plain_models import A, plain
 from test_chance import lost
 from test_diagnose import logs, system
@@ -301,3 +302,12 @@ def test_the_gap_of_the_commands_that_were_sent_is_with_parameters_that_were_fit
     points = [sent.nominal.point, again.nominal.point]
     assert [told.refit, told.effects] == pytest.approx(_along(test, pieces, points).tolist())
     assert told.refit != pytest.approx(told.effects, rel=0.05)
+
+
+def test_commands_lost_by_a_robot_whose_contacts_scramble_predictions_soon():
+    """Over eight steps of 50 ms feet meet the ground by chance; over three the losses show."""
+    system, logs, _ = cheetah(lost=0.3, amplitude=1.0)
+    report = diagnose(system, None, logs, effects=("packet_drop", "action_delay"))
+    (found,) = report.effects
+    assert (found.name, found.where) == ("packet_drop", "bshin")
+    assert found.ci95[0] < 0.3 < found.ci95[1]

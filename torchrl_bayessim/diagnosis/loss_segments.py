@@ -7,7 +7,7 @@ what happened, whatever the drive does with commands. Those of samples are the s
 
 from __future__ import annotations
 
-__all__ = ["STEPS", "LossSegments", "command_slopes", "loss_segments"]
+__all__ = ["LossSegments", "command_slopes", "loss_segments", "steps_of"]
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ from .segments import cut
 
 Array = NDArray[np.float64]
 Patterns = Sequence[tuple[bool, ...]]
-STEPS = 8  # of a segment
+_STEPS = 8  # of a segment, at most
 _TOGETHER = 4  # losses in a segment, at most
 _MOST = {"train": 90, "validation": 45, "test": 45}  # segments
 _NUDGE, _SAME = 0.2, 0.01  # of the largest command, and of that: a change that is none
@@ -152,13 +152,19 @@ def command_slopes(
     return np.stack(slopes, -1)
 
 
+def steps_of(prepared: Prepared) -> int:
+    """Return how many steps a segment has: no more than contacts leave of the effects there."""
+    return min(_STEPS, prepared.horizon)
+
+
 def loss_segments(prepared: Prepared) -> dict[str, LossSegments]:
     """Return short segments of every split, compared after each of their steps."""
     prior, point = prepared.predictor.system.prior, Point(prepared.nominal.point.z)
     history = max(prepared.sets["train"].segments.history, 1)
-    found = {}
+    found, steps = {}, steps_of(prepared)
     for name, logs in prepared.logs.items():
-        pieces = cut(logs, STEPS, history=history, most=_MOST[name], burn_in=history)
+        most = _MOST[name] * _STEPS // steps
+        pieces = cut(logs, steps, history=history, most=most, burn_in=history)
         objective = prepared.mode.objective(
             prepared.predictor, prior, pieces, z=point.z, noise=prepared.noise
         )

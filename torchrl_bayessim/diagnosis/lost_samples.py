@@ -24,7 +24,7 @@ from ..logs.log import Log
 from ..logs.velocity import Windows, velocity
 from .beside_losses import CERTAIN, Beside, Sought
 from .loss_law import LossLaw
-from .loss_segments import STEPS, LossSegments
+from .loss_segments import LossSegments, steps_of
 from .loss_suspects import LIKELIER, Alone
 from .losses import found_beside
 from .objective import Point, Unit
@@ -81,12 +81,13 @@ class _Renewal:
             logs: Of a split.
             point: The simulator in which it is decided on.
         """
-        return [self._renewed(log, point) if len(log) > 2 * STEPS else log for log in logs]
+        least = 2 * steps_of(self.prepared)
+        return [self._renewed(log, point) if len(log) > least else log for log in logs]
 
     def _renewed(self, log: Log, point: Point) -> Log:
         prepared = self.prepared
         history = max(prepared.sets["train"].segments.history, 1)
-        pieces = cut([log], STEPS, history=history, stride=_STRIDE)
+        pieces = cut([log], steps_of(prepared), history=history, stride=_STRIDE)
         predictor, noise = prepared.predictor, prepared.noise
         objective = prepared.mode.objective(
             predictor, predictor.system.prior, pieces, z=point.z, noise=noise
