@@ -11,10 +11,10 @@ from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.system import System
 
 
-def cheetah(*, noise=None, stiffness=0.0, amplitude=0.5, lost=0.0, runs=4, seed=0):
+def cheetah(*, noise=None, stiffness=0.0, amplitude=0.5, lost=0.0, shaken=0.0, runs=4, seed=0):
     """Return HalfCheetah, logs of one with a spring more, and the logs' noise.
 
-    Or of one that loses commands of its back shin.
+    Or of one that loses commands of its back shin, or whose back foot is shaken, at four hertz.
     """
     task = known_task("HalfCheetah-v5")
     model, rng, logs = copy.copy(task.model), np.random.default_rng(seed), []
@@ -29,7 +29,9 @@ def cheetah(*, noise=None, stiffness=0.0, amplitude=0.5, lost=0.0, runs=4, seed=
             data.ctrl[:] = u
             if lost and rng.random() < lost:
                 data.ctrl[1] = held
-            mujoco.mj_step(model, data, task.frame_skip)
+            for _ in range(task.frame_skip):
+                data.qfrc_applied[5] = shaken * np.sin(2 * np.pi * 4.0 * data.time + 1.0)
+                mujoco.mj_step(model, data)
         state = torch.from_numpy(np.array(rows))
         logs.append(
             Log(

@@ -9,6 +9,7 @@ from noisy_cheetah import cheetah
 from torchrl_bayessim.diagnosis import horizon
 from torchrl_bayessim.diagnosis.objective import units_of
 from torchrl_bayessim.diagnosis.prediction import Predictor
+from torchrl_bayessim.diagnosis.whitening import whitening
 from torchrl_bayessim.effects.catalogue import CATALOGUE, effect
 from torchrl_bayessim.logs.touching import Touching
 
@@ -28,6 +29,20 @@ def test_no_longer_than_a_signature_survives_the_noise_of_the_start(monkeypatch)
     assert chosen(noisier=10.0) == 3
     monkeypatch.setattr(horizon, "_alike", lambda *_: 1.0)
     assert chosen(noisier=10.0) > 3
+
+
+def _linear(*arguments, generator):
+    return whitening(*arguments)
+
+
+def test_rows_that_contacts_make_loud_tell_less(monkeypatch):
+    system, logs, noise = cheetah(amplitude=1.0)
+    names = "viscous_friction", "coulomb_friction", "action_gain", "sensor_bias"
+    units = units_of([effect(name) for name in names], system.robot)
+    given = {"units": units, "noise": noise, "history": 8}
+    assert horizon.chosen_horizon(Predictor(system), logs, **given) == 3
+    monkeypatch.setattr(horizon, "whitening", _linear)
+    assert horizon.chosen_horizon(Predictor(system), logs, **given) > 3
 
 
 def settled(rows):

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from noisy_cheetah import cheetah
 from rail_cart import cart, ride
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
-from torchrl_bayessim.diagnosis.shapes import _numbers, _sine
+from torchrl_bayessim.diagnosis.shapes import _cogging, _numbers, _sine
 from torchrl_bayessim.effects.disturbance import Cogging
 from torchrl_bayessim.effects.effect import Reach
 
@@ -101,3 +102,24 @@ def test_a_wave_shows_where_forces_are_sure():
     rate, phase = _sine(force, weight, 2 * np.pi * time, rates)
     assert rate == pytest.approx(3.1, abs=0.15)
     assert phase == pytest.approx(0.4, abs=0.4)
+
+
+def test_a_foot_that_is_shaken_is_found_though_forces_at_all_joints_could_be_its_own():
+    """At 20 Hz, where six steps are longer than a period of its 4 Hz."""
+    system, logs, _ = cheetah(shaken=4.0)
+    report = diagnose(system, None, logs, effects=("periodic_disturbance", "constant_force"))
+    assert [effect.name for effect in report.effects] == ["periodic_disturbance"]
+    assert report.effects[0].strengths["bfoot"] == pytest.approx(4.0, rel=0.05)
+    (first, *_) = report.strengths
+    assert first.frequency == pytest.approx(4.0, rel=5e-3)
+
+
+def test_a_rate_that_is_known_is_not_offered_twice():
+    """Of a slide whose segments cover its way there is one rate, and forces alone are the same."""
+    rng = np.random.default_rng(0)
+    positions = rng.uniform(0.0, 0.1, 60)[:, None] + np.linspace(-0.05, 0.05, 6)
+    force, weight = np.sin(30.0 * positions[:, 3]), np.ones(60)
+    for numbers in (np.array([30.0]), np.arange(10.0, 60.0, 5.0)):
+        found = _cogging(force, weight, positions, numbers, there=[])
+        assert len(found) == 1
+        assert _cogging(force, weight, positions, numbers, there=found) == []

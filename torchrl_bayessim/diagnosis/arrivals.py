@@ -12,6 +12,7 @@ __all__ = ["Arrivals", "fewer"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -21,7 +22,7 @@ from scipy.special import logsumexp
 
 from ..logs.log import Log
 from .loss_law import LossLaw
-from .loss_segments import command_slopes
+from .loss_segments import command_slopes, steps_of
 from .objective import Point
 from .preparation import Prepared
 from .segments import cut
@@ -29,9 +30,7 @@ from .segments import cut
 Array = NDArray[np.float64]
 _LARGEST = 1_000_000  # control steps simulated to decide on all commands
 _SOME = "which commands arrived was decided on in {} of {} runs: all would have taken long"
-_SIMULATED = 18  # for each row and actuator
-_STEPS, _SETTLED = 8, 4  # of a segment, and of those the ones that are decided on
-_PATTERNS = np.array(list(product((False, True), repeat=_STEPS)))  # the first steps vary slowest
+_SIMULATED = 18  # for each row and actuator, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +59,7 @@ class Arrivals:
         return {name: self._decided(part, known[name]) for name, part in sent.items()}
 
     def _decided(self, sent: Sequence[Log], known: Sequence[Log]) -> list[Log]:
-        number = [i for i, log in enumerate(sent) if len(log) > _STEPS]
+        number = [i for i, log in enumerate(sent) if len(log) > steps_of(self.prepared)]
         if not number:
             return list(known)
         effects = _Overlapping.of(self, [sent[i] for i in number], [known[i] for i in number])
@@ -83,6 +82,7 @@ class _Overlapping:
         start: The row at which each starts, shape ``(S,)``.
         left: Innovations, shape ``(S, M)``.
         slopes: What a change of each command does, shape ``(S, M, A H)``.
+        steps: ``H``.
     """
 
     sent: Sequence[Array]
@@ -92,25 +92,27 @@ class _Overlapping:
     start: NDArray[np.int64]
     left: Array
     slopes: Array
+    steps: int
 
     @classmethod
     def of(cls, arrivals: Arrivals, sent: Sequence[Log], known: Sequence[Log]) -> _Overlapping:
         """Simulate segments of some logs, and what a change of each command does to them."""
         prepared, point = arrivals.prepared, arrivals.point
         history = max(prepared.sets["train"].segments.history, 1)
-        pieces = cut(known, _STEPS, history=history, stride=_SETTLED)
+        steps = steps_of(prepared)
+        pieces = cut(known, steps, history=history, stride=_settled(steps))
         prior, noise = prepared.predictor.system.prior, prepared.noise
         objective = prepared.mode.objective(
             prepared.predictor, prior, pieces, z=point.z, noise=noise
         )
         left = objective([point])[0]
         commands = [log.ctrl.numpy() for log in sent]
-        rows = pieces.start[:, None] + np.arange(_STEPS)
+        rows = pieces.start[:, None] + np.arange(steps)
         told = np.stack([commands[i][k] for i, k in zip(pieces.log, rows, strict=True)])
         at, slopes = history, []
         for a in arrivals.actuators:
-            now = pieces.ctrl[:, at : at + _STEPS, a]
-            before = pieces.ctrl[:, at - 1 : at + _STEPS - 1, a]
+            now = pieces.ctrl[:, at : at + steps, a]
+            before = pieces.ctrl[:, at - 1 : at + steps - 1, a]
             others = np.where(now == told[..., a], before, told[..., a])
             slopes.append(command_slopes(objective, point, left, a, others=others))
         return cls(
@@ -121,36 +123,49 @@ class _Overlapping:
             start=pieces.start,
             left=left,
             slopes=np.concatenate(slopes, -1),
+            steps=steps,
         )
 
     def arrived(self, log: int, law: LossLaw) -> Array:
         """Return the commands of a log that are likely to have arrived, ``(T, nu)``."""
         sent, found = self.sent[log][:, self.actuators], self.sent[log].copy()
+        steps, settled, patterns = self.steps, _settled(self.steps), _patterns(self.steps)
         held, mine = sent[0], np.flatnonzero(self.log == log)
-        ends = [*self.start[mine[1:]].tolist(), int(self.start[mine[-1]]) + _STEPS]
+        ends = [*self.start[mine[1:]].tolist(), int(self.start[mine[-1]]) + steps]
         for segment, end in zip(mine, ends, strict=True):
             at = int(self.start[segment])
-            paths = _paths(sent[at : at + _STEPS], held)
+            paths = _paths(sent[at : at + steps], held)
             logs = self._density(int(segment), paths, law)
             if at == 0:  # nothing is known from before the first
-                logs = np.where(_PATTERNS[:, 0], -np.inf, logs)
+                logs = np.where(patterns[:, 0], -np.inf, logs)
             if segment == mine[-1]:
                 chosen = int(logs.argmax())
             else:
-                first = logsumexp(logs.reshape(1 << _SETTLED, -1), axis=1)
-                chosen = int(first.argmax()) << (_STEPS - _SETTLED)
+                first = logsumexp(logs.reshape(1 << settled, -1), axis=1)
+                chosen = int(first.argmax()) << (steps - settled)
             found[at:end, self.actuators] = paths[chosen, : end - at]
             held = paths[chosen, end - at - 1]
         return found
 
     def _density(self, segment: int, paths: Array, law: LossLaw) -> Array:
         """Return the log density of a segment under each pattern of losses, ``(B,)``."""
-        at, lost = int(self.start[segment]), _PATTERNS.sum(1)
-        now = self.known[int(self.log[segment])][at : at + _STEPS, self.actuators]
+        at, lost = int(self.start[segment]), _patterns(self.steps).sum(1)
+        now = self.known[int(self.log[segment])][at : at + self.steps, self.actuators]
         change = (paths - now).transpose(0, 2, 1).reshape(len(paths), -1)
         squares = ((self.left[segment] + change @ self.slopes[segment].T) ** 2).sum(-1)
-        prior = lost * np.log(law.share) + (_STEPS - lost) * np.log1p(-law.share)
+        prior = lost * np.log(law.share) + (self.steps - lost) * np.log1p(-law.share)
         return np.asarray(prior - 0.5 * squares / law.scatter)
+
+
+def _settled(steps: int) -> int:
+    """Return how many of the steps of a segment are decided on."""
+    return max(1, steps // 2)
+
+
+@cache
+def _patterns(steps: int) -> NDArray[np.bool_]:
+    """Return every pattern of losses, the first steps vary slowest, ``(2^H, H)``."""
+    return np.array(list(product((False, True), repeat=steps)))
 
 
 def _paths(sent: Array, held: Array) -> Array:
@@ -165,10 +180,11 @@ def _paths(sent: Array, held: Array) -> Array:
         >>> paths[0b10010000, :, 0]  # the first and the fourth are lost
         array([0., 2., 3., 3., 5., 6., 7., 8.])
     """
-    now = np.broadcast_to(held, (len(_PATTERNS), len(held)))
-    paths = np.empty((len(_PATTERNS), *sent.shape))
+    patterns = _patterns(len(sent))
+    now = np.broadcast_to(held, (len(patterns), len(held)))
+    paths = np.empty((len(patterns), *sent.shape))
     for t, command in enumerate(sent):
-        now = np.where(_PATTERNS[:, t, None], now, command)
+        now = np.where(patterns[:, t, None], now, command)
         paths[:, t] = now
     return paths
 

@@ -41,8 +41,9 @@ def chosen_horizon(
     Chosen on what simulations of the effects would look like, never on the residuals: largest
     ``Σ_e log(1 + λ_e)`` with ``λ_e`` the squared length of the whitened signature at a tenth of the
     range, as long as second differences stay below first ones, and signatures much the same at
-    another draw of the start's noise: what contacts scramble no fit can follow. Where start states
-    were estimated, few steps hardly say how a segment began, and nothing else; nor where contacts
+    another draw of the start's noise: what contacts scramble no fit can follow. Rows in which
+    contacts make more of that noise than its linear view says count less. Where start states were
+    estimated, few steps hardly say how a segment began, and nothing else; nor where contacts
     were, unless these many are scrambled.
     """
     typical = float(np.median([len(log) for log in logs]))
@@ -94,15 +95,15 @@ def _shown(
     prior = predictor.system.prior
     z = origin(prior)
     pieces = cut_for_fits(logs, steps, history=history, most=max(4, _PROBE // steps))
-    # what contacts make of the start's noise tells nothing of effects
-    generator = np.random.default_rng(0) if predictor.colliding else None
+    # a guessed start is surer than its covariance says: draws from that would scramble too much
+    drawn = predictor.colliding and pieces.uncertainty is None
+    generator = np.random.default_rng(0) if drawn else None
     white = whitening(predictor, pieces, parameters_at(prior, z), noise, generator=generator)
     if white.curvature > _BENT:
         return -np.inf
     objective = Objective(predictor, prior, pieces, white)
     points = [Point(z), *(Point(z, {unit: 0.1 * unit.high}) for unit in units)]
     signatures = _signatures(objective, points)
-    # a guessed start is surer than its covariance says, so draws of that would scramble too much
     if white.curvature > _STRAIGHT and pieces.uncertainty is None:
         root = start_noise(predictor, pieces, noise)
         other = _signatures(objective, points, drawn_starts(root, 1, np.random.default_rng(0)))

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 Patterns = Sequence[tuple[bool, ...]]
 _STEPS = 8  # of a segment, at most
 _TOGETHER = 4  # losses in a segment, at most
-_MOST = {"train": 90, "validation": 45, "test": 45}  # segments
+_MOST = {"train": 90, "validation": 45, "test": 45}  # segments of so many steps
 _NUDGE, _SAME = 0.2, 0.01  # of the largest command, and of that: a change that is none
 
 

@@ -34,7 +34,6 @@ from .segments import cut
 
 Array = NDArray[np.float64]
 _SPOILED = 0.01  # of segments, by something else
-_STRIDE = 4  # rows from one segment to the next: each sample is decided on twice
 
 
 def beside_lost_samples(sought: Sought) -> Beside | None:
@@ -87,7 +86,9 @@ class _Renewal:
     def _renewed(self, log: Log, point: Point) -> Log:
         prepared = self.prepared
         history = max(prepared.sets["train"].segments.history, 1)
-        pieces = cut([log], steps_of(prepared), history=history, stride=_STRIDE)
+        steps = steps_of(prepared)
+        stride = max(1, steps // 2)  # each sample is decided on twice
+        pieces = cut([log], steps, history=history, stride=stride)
         predictor, noise = prepared.predictor, prepared.noise
         objective = prepared.mode.objective(
             predictor, predictor.system.prior, pieces, z=point.z, noise=noise

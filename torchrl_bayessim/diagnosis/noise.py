@@ -21,7 +21,7 @@ from .whitening import ENOUGH, innovation_noise, noise_from_differences, whiteni
 
 Array = NDArray[np.float64]
 UNCERTAIN = "noise floor uncertain"  # how that alarm begins
-_ROUNDS = 8  # third differences of fast motion start a hundred times too high
+_ROUNDS, _CORRECTIONS = 8, 4  # third differences of fast motion start a hundred times too high
 _AT_ONCE = 5.0  # the most that a round trusts: too large a noise hides how far it is too large
 _SETTLED = 0.1  # logarithm of a factor that is not worth another round
 _STEPS, _FEWER = 8, 4  # control steps of a segment; where that makes few segments, half of them
@@ -29,7 +29,7 @@ _BEYOND = 3.0  # times its spec, or its like, that a sensor is not noisier than
 _ROUGHLY = 2.0  # times what third differences say
 _LIKE = 3  # sensors of one kind
 _DRAWS = 8  # simulated robots whose noise is known
-_MISSED, _MOST_MISSED = 1.1, 1.6  # factors by which it is found too large: worth it, and believed
+_MOST_MISSED = 1.6  # the most by which contacts make it seem larger than it is
 
 
 class _Known(NamedTuple):
@@ -83,26 +83,23 @@ def measured_noise(
     """
     system, known = predictor.system, _Known.of(predictor, logs)
     pieces = _pieces(logs, history=history)
-    pushes = pushes_of(system.robot)
     at, noise = beside or (Point(origin(system.prior)), known.assumed)
-    estimate, missed = noise, np.ones_like(noise)
-    for rounds in range(1, _ROUNDS + 1):
-        white = whitening(predictor, pieces, parameters_at(system.prior, at.z), noise)
-        objective = Objective(predictor, system.prior, pieces, white)
-        fit = refit(objective, [at], iterations=4)[0]
-        at = fit.point
-        points = [_pushed(at, unit) for unit in pushes]
-        pushed = objective(points) if points else np.zeros((0, *fit.innovations.shape))
-        pushed -= fit.innovations
-        factor = innovation_noise(fit.innovations, pushed, len(pieces.checked))
+    estimate = noise
+    for _ in range(_ROUNDS):
+        at, factor = _round(predictor, pieces, at, noise)
         noise = np.maximum(noise * np.clip(factor, 1 / _AT_ONCE, _AT_ONCE), known.tiny)
         estimate, noise = noise, np.minimum(noise, _most(noise, known, system.robot))
-        settled = np.abs(np.log(np.maximum(factor, 1e-9))).max() < _SETTLED
-        if settled or rounds == _ROUNDS:
-            missed = _missed(objective, at, pushed, noise=noise)
+        if _settled(factor):
             break
-    noise = _without_chance(noise, known, missed)
-    noise = np.minimum(noise, _most(noise, known, system.robot))
+    linear = noise
+    if predictor.colliding and pieces.uncertainty is None:
+        for _ in range(_CORRECTIONS):
+            at, factor = _round(predictor, pieces, at, noise, drawn=True)
+            noise = np.clip(noise * factor, _least(linear, known), _MOST_MISSED * linear)
+            noise = np.minimum(noise, _most(noise, known, system.robot))
+            if _settled(factor):
+                break
+    estimate = estimate * noise / linear
     apart = [
         f"{name}: {estimate:.3g} against {spec:.3g}"
         for name, estimate, spec in zip(system.robot.channels, estimate, known.given, strict=True)
@@ -114,28 +111,52 @@ def measured_noise(
     return noise, source if beside is None else f"{source} beside the effects found first"
 
 
-def _missed(objective: Objective, point: Point, pushed: Array, *, noise: Array) -> Array:
-    """Return how much too large noise is found on simulated robots, where it is known, ``(C,)``.
+def _settled(factor: Array) -> bool:
+    return bool(np.abs(np.log(np.maximum(factor, 1e-9))).max() < _SETTLED)
 
-    One where starts were estimated from the rows that they are to predict: such an estimate is
-    better than its covariance says, and draws from that would make all noise look small.
+
+def _round(
+    predictor: Predictor, pieces: Segments, at: Point, noise: Array, *, drawn: bool = False
+) -> tuple[Point, Array]:
+    """Fit the parameters, and return them and by which factor each channel's noise differs.
+
+    Args:
+        predictor: Simulates.
+        pieces: Segments.
+        at: Where the fit starts.
+        noise: That is assumed, shape ``(C,)``.
+        drawn: Whether it is compared with robots that are simulated with it.
     """
-    if objective.segments.uncertainty is not None:
-        return np.ones_like(noise)
-    drawn = objective.made_by_noise(point, noise, draws=_DRAWS, generator=np.random.default_rng(0))
-    checks = len(objective.segments.checked)
-    found = [innovation_noise(one, pushed, checks) for one in objective.whitening(drawn)]
-    return np.median(found, axis=0)
+    prior, pushes = predictor.system.prior, pushes_of(predictor.system.robot)
+    white = whitening(predictor, pieces, parameters_at(prior, at.z), noise)
+    objective = Objective(predictor, prior, pieces, white)
+    fit = refit(objective, [at], iterations=4)[0]
+    points = [_pushed(fit.point, unit) for unit in pushes]
+    pushed = objective(points) if points else np.zeros((0, *fit.innovations.shape))
+    made = _drawn(objective, fit.point, noise) if drawn else None
+    changes = pushed - fit.innovations
+    return fit.point, innovation_noise(fit.innovations, changes, len(pieces.checked), drawn=made)
 
 
-def _without_chance(noise: Array, known: _Known, missed: Array) -> Array:
-    """Return noise without what the linear view of it misses: what contacts make of it.
+def _drawn(objective: Objective, point: Point, noise: Array) -> Array:
+    """Return innovations that noise alone leaves, unit noise where one diverged, ``(N, S, KC)``."""
+    generator = np.random.default_rng(0)
+    unit = generator.standard_normal((_DRAWS, *objective.whitening.drift.shape))
+    made = objective.made_by_noise(point, noise, draws=_DRAWS, generator=generator)
+    finite = np.isfinite(made.reshape(*unit.shape)).all(-1, keepdims=True)
+    return np.where(finite, objective.whitening(made), unit)
 
-    At most so much that a sensor is as good as its spec, if there is one. A robot that is simulated
-    from a measured start has twice its noise: a foot is deeper in the ground, and more is missed.
+
+def _least(linear: Array, known: _Known) -> Array:
+    """Return what noise is at least, of which the linear view says so much, shape ``(C,)``.
+
+    A sensor is no better than its spec, if there is one. And what contacts make of noise is not
+    believed beyond reason: a robot that is simulated from a measured start has twice its noise, so
+    that a foot is deeper in the ground, and more of it is missed. Without a bound all noise could
+    be taken for what contacts make of less and less.
     """
-    less = noise / np.clip(np.where(missed > _MISSED, missed, 1.0), 1.0, _MOST_MISSED)
-    return np.where(known.given > 0, np.maximum(less, np.minimum(noise, known.given)), less)
+    least = linear / _MOST_MISSED
+    return np.where(known.given > 0, np.maximum(least, np.minimum(linear, known.given)), least)
 
 
 def _pushed(point: Point, push: Unit) -> Point:

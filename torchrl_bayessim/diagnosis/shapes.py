@@ -5,9 +5,9 @@ beside their strength, which no screen at fixed values can find. Over a few step
 nearly constant, so its course is estimated first, one value per short segment and joint, and the
 best sine over time and over position is fitted to it: to the force that is missing beside those of
 other joints, and to the one that alone would explain most (see `missing_force`). Segments begin at
-every half of their length, so that a fast sine is not taken for a slow one which is the same in
-every segment. So is fitted what rounding the recorded commands would have taken away or added,
-since signatures of two steps that differ a little have nothing in common.
+every half of their length, or nearly, so that a fast sine is not taken for a slow one which is the
+same in every segment. So is fitted what rounding the recorded commands would have taken away or
+added, since signatures of two steps that differ a little have nothing in common.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ _SLOWEST = 0.5  # cycles per log: slower ones are trends
 _FASTEST = 0.75  # cycles per segment, of which the mean is a third of the largest force
 _FEWEST, _NUMBERS = 2.0, 25.0  # cogs per turn; one is gravity's
 _SAME = 1.5  # steps between rates that are tried: the same one
+_TURNED = 0.01  # rad, of a phase that is another one
 _CLEAR = 0.1  # share of the force's variance that a sine or a step must explain
 _ALIKE = 0.1  # of the median variance of forces
 _FINEST, _GRID = 0.02, 600  # of the largest step that is plausible; steps tried
@@ -111,22 +112,35 @@ def _cogging(
     force: Array, weight: Array, positions: Array, numbers: Array, *, there: Sequence[Effect]
 ) -> list[Effect]:
     """Return the cogging that stands out, beside a constant or as part of a wave, if it is new."""
-    middle = positions[:, positions.shape[1] // 2]
     others = [e.number for e in there if isinstance(e, Cogging)]
+    middle = _middle(positions)
     best = _sine(force, weight, middle, numbers)
     if best is None or _known(best[0], others, numbers):
         return []
     found: list[Effect] = [Cogging(number=best[0], phase=best[1])]
     if best[0] * np.ptp(positions) < 2 * np.pi:
-        best = _sine(force, weight, middle, numbers, offset=False)
-        found += [] if best is None else [Cogging(number=best[0], phase=best[1])]
+        part = _sine(force, weight, middle, numbers, offset=False)
+        new = part is not None and (part[0] != best[0] or abs(part[1] - best[1]) > _TURNED)
+        found += [Cogging(number=part[0], phase=part[1])] if part is not None and new else []
     return found
+
+
+def _middle(rows: Array) -> Array:
+    """Return what rows ``(S, T)`` of segments hold in the middle of their ``T`` steps, ``(S,)``.
+
+    Example:
+        >>> rows = np.arange(4.0)[None]
+        >>> float(_middle(rows)[0]), float(_middle(rows[:, :3])[0])
+        (2.0, 1.5)
+    """
+    half = rows.shape[1] // 2
+    return 0.5 * (rows[:, half] + rows[:, half + rows.shape[1] % 2])
 
 
 def _known(rate: float, others: Sequence[float], rates: Array) -> bool:
     """Return whether a rate is one of others, or next to it among those that are tried."""
     apart = float(rates[1] - rates[0]) if len(rates) > 1 else 0.0
-    return any(abs(rate - other) < _SAME * apart for other in others)
+    return any(abs(rate - other) <= _SAME * apart for other in others)
 
 
 def at_step(unit: Unit, step: float) -> Unit:
@@ -144,9 +158,10 @@ def _missing(
     history: int,
     steps: int,
 ) -> tuple[tuple[tuple[Array, Array], tuple[Array, Array]], Array, Array, Array]:
-    """Return missing forces of short segments with their weights, together and each alone.
+    """Return missing forces of short segments, together and alone, times, positions and commands.
 
-    Of shape ``(S, J)``. And times, positions and commands.
+    Of the forces, and how much each counts, ``(S, J)``; of the time in the middle ``(S,)``; of the
+    others at every row of a segment, ``(S, T, *)``.
     """
     half = steps // 2
     shifted = [stretch(log, half, len(log)) for log in logs]
@@ -161,10 +176,10 @@ def _missing(
         ways.append(missing_forces(objective, point, pushes))
         begin = pieces.history
         window = slice(begin, begin + steps)
-        seen.append((pieces.time[:, begin + half], pieces.qpos[:, window], pieces.ctrl[:, window]))
+        seen.append((pieces.time[:, window], pieces.qpos[:, window], pieces.ctrl[:, window]))
     time, qpos, ctrl = (np.concatenate(part) for part in zip(*seen, strict=True))
     together, alone = (_weighed(way) for way in zip(*ways, strict=True))
-    return (together, alone), time, qpos, ctrl
+    return (together, alone), _middle(time), qpos, ctrl
 
 
 def _weighed(parts: Sequence[Forces]) -> tuple[Array, Array]:

@@ -48,6 +48,7 @@ _UNEVEN = 1.3  # ratio of the first two estimates, beyond which some segments ho
 ENOUGH = 40  # segments, to single out a quarter of them
 _DRAWS = 24  # simulated robots that the whitening is checked on
 _UNIT = 8  # draws of unit noise
+_MISSED = 1.2  # times what the linear view says, from which variances of simulated robots count
 _THIRD_DIFFERENCE = 20.0  # 1 + 9 + 9 + 1: variance of y₃ - 3y₂ + 3y₁ - y₀ per unit of white noise
 
 
@@ -237,43 +238,54 @@ def noise_from_differences(logs: Sequence[Log], values: Sequence[Array]) -> Arra
     return spread / np.sqrt(_THIRD_DIFFERENCE)
 
 
-def innovation_noise(innovations: Array, pushes: Array, checks: int) -> Array:
+def innovation_noise(
+    innovations: Array, pushes: Array, checks: int, *, drawn: Array | None = None
+) -> Array:
     """Return by which factor each channel's noise differs from what was assumed, shape ``(C,)``.
 
     ``σ̂² = mean ½(ε_{t+1} - ε_t)²`` over innovations in order of time, divided by what unit noise
-    gives in the same way: a model's error is smooth, and so drops out. What a constant force at any
-    joint could explain within the segment is projected out first, since over a few steps a missing
-    force is hardly more than that. The worst tenth of the segments is left out, or, where the worse
-    half of many has more than its part, all but the calmest quarter: noise is the same everywhere,
-    and what a missing effect does, such as an impact where backlash closes, is not.
+    gives in the same way, or simulated robots whose noise is known, where the linear view misses
+    much of theirs: a model's error is smooth, and so drops out. What a constant force at any joint
+    could explain within the segment is projected out first, since over a few steps a missing force
+    is hardly more than that. The worst tenth of the segments is left out, or, where the worse half
+    of many has more than its part, all but the calmest quarter: noise is the same everywhere, and
+    what a missing effect does, such as an impact where backlash closes, is not.
 
     Args:
         innovations: Shape ``(S, KC)``.
         pushes: What a force at each joint changes, shape ``(J, S, KC)``.
         checks: Rows per segment, ``K``.
+        drawn: Innovations of simulated robots, shape ``(draws, S, KC)``.
     """
-    size, channels = innovations.shape[1], innovations.shape[1] // checks
+    segments, size = innovations.shape
+    channels = size // checks
     basis = np.moveaxis(pushes, 0, -1)
     left, values, _ = np.linalg.svd(basis, full_matrices=False)
     left = left * (values > 1e-6 * np.maximum(values[:, :1], 1e-12))[:, None]
     steps = np.eye(size)[channels:] - np.eye(size)[:-channels]
 
     def squares(some: Array) -> Array:
-        rest = some - np.einsum("smj,snj,sn->sm", left, left, some)
-        return ((rest @ steps.T) ** 2).reshape(len(some), checks - 1, channels).sum(1)
+        rest = some - np.einsum("smj,snj,rsn->rsm", left, left, some, optimize=True)
+        changes = (rest @ steps.T) ** 2
+        return changes.reshape(len(some), segments, checks - 1, channels).sum(2)
 
-    generator = np.random.default_rng(0)
-    unit = [squares(one) for one in generator.standard_normal((_UNIT, *innovations.shape))]
-    found = squares(innovations)
+    unit = squares(np.random.default_rng(0).standard_normal((_UNIT, segments, size)))
+    found, simulated = squares(innovations[None]), None if drawn is None else squares(drawn)
 
     def factor(share: float) -> Array:
-        return _calm(found, share) / np.mean([_calm(one, share) for one in unit], axis=0)
+        usual = _calm(unit, share)
+        if simulated is not None:
+            made = _calm(simulated, share)
+            # they start where noise has put a foot into the ground already: they err upwards
+            usual = np.where(made > _MISSED * usual, made, usual)
+        return _calm(found, share) / usual
 
     most, half, calm = (factor(share) for share in (_MOST, _HALF, _CALM))
-    uneven = (most > _UNEVEN * half) & (len(innovations) >= ENOUGH)
+    uneven = (most > _UNEVEN * half) & (segments >= ENOUGH)
     return np.sqrt(np.where(uneven, calm, most))
 
 
 def _calm(squares: Array, share: float) -> Array:
-    """Return sums over the calmest segments, of squares ``(S, C)``."""
-    return np.where(squares <= np.quantile(squares, share, axis=0), squares, 0.0).sum(0)
+    """Return sums over the calmest segments, of squares ``(N, S, C)``; their mean, ``(C,)``."""
+    most = np.quantile(squares, share, axis=1, keepdims=True)
+    return np.asarray(np.where(squares <= most, squares, 0.0).sum(1).mean(0))
