@@ -91,15 +91,10 @@ def measured_noise(
         estimate, noise = noise, np.minimum(noise, _most(noise, known, system.robot))
         if _settled(factor):
             break
-    linear = noise
+    # a guessed start is surer than its covariance says: draws from that would make noise look small
     if predictor.colliding and pieces.uncertainty is None:
-        for _ in range(_CORRECTIONS):
-            at, factor = _round(predictor, pieces, at, noise, drawn=True)
-            noise = np.clip(noise * factor, _least(linear, known), _MOST_MISSED * linear)
-            noise = np.minimum(noise, _most(noise, known, system.robot))
-            if _settled(factor):
-                break
-    estimate = estimate * noise / linear
+        linear, noise = noise, _corrected(predictor, pieces, at, linear=noise, known=known)
+        estimate = estimate * noise / linear
     apart = [
         f"{name}: {estimate:.3g} against {spec:.3g}"
         for name, estimate, spec in zip(system.robot.channels, estimate, known.given, strict=True)
@@ -109,6 +104,28 @@ def measured_noise(
         alarms.append(UNCERTAIN + ", estimated against specified: " + ", ".join(apart))
     source = "differences of innovations"
     return noise, source if beside is None else f"{source} beside the effects found first"
+
+
+def _corrected(
+    predictor: Predictor, pieces: Segments, at: Point, *, linear: Array, known: _Known
+) -> Array:
+    """Return noise as robots have it that are simulated with it, shape ``(C,)``.
+
+    Args:
+        predictor: Simulates.
+        pieces: Segments.
+        at: Where fits start.
+        linear: Noise by the linear view of what contacts make of it, ``(C,)``.
+        known: From before any fit.
+    """
+    noise = linear
+    for _ in range(_CORRECTIONS):
+        at, factor = _round(predictor, pieces, at, noise, drawn=True)
+        noise = np.clip(noise * factor, _least(linear, known), _MOST_MISSED * linear)
+        noise = np.minimum(noise, _most(noise, known, predictor.system.robot))
+        if _settled(factor):
+            break
+    return noise
 
 
 def _settled(factor: Array) -> bool:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from ..effects.action import ActionQuantization
 from ..effects.disturbance import Cogging, PeriodicDisturbance
 from ..effects.effect import Effect
+from ..effects.robot import Robot
 from ..effects.units import slides
 from ..logs.log import Log
 from .missing_force import Forces, missing_forces
@@ -85,16 +86,23 @@ def shaped(
             found += _waving(*seen, time, frequencies, there=found)
             found += _cogging(*seen, positions, numbers, there=found)
         units += [u for u in units_of(found, system.robot) if u.where == push.where]
-    force, weight = ways[0]
-    for unit in units_of([ActionQuantization()], system.robot):
-        joint, actuator = unit.joint(system.robot), unit.direction.index(1.0)
-        column = next((i for i, p in enumerate(pushes) if p.joint(system.robot) == joint), None)
+    return units + _rounded(*ways[0], ctrl, pushes=pushes, robot=system.robot)
+
+
+def _rounded(
+    force: Array, weight: Array, ctrl: Array, *, pushes: Sequence[Unit], robot: Robot
+) -> list[Unit]:
+    """Return rounded commands of those drives of which a step stands out."""
+    found = []
+    for unit in units_of([ActionQuantization()], robot):
+        joint, actuator = unit.joint(robot), unit.direction.index(1.0)
+        column = next((i for i, p in enumerate(pushes) if p.joint(robot) == joint), None)
         if joint < 0 or column is None or unit.where == "all":
             continue
         step = _rounding(force[:, column], weight[:, column], ctrl[..., actuator], most=unit.high)
         if step is not None:
-            units.append(at_step(unit, step))
-    return units
+            found.append(at_step(unit, step))
+    return found
 
 
 def _waving(
