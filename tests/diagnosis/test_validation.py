@@ -1,11 +1,15 @@
 """Where test runs hardly show a gap, validation runs may, if they do so surely."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rail_cart import cart, ride
 
+from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
+from torchrl_bayessim.diagnosis.splits import split
 from torchrl_bayessim.diagnosis.validation import enough, hardly_shown, share_on_validation
 
 
@@ -49,3 +53,22 @@ def test_test_runs_that_exclude_what_validation_runs_say_say_so(refit, interval,
 
 def test_a_doubtful_gap_needs_a_larger_share():
     assert enough(1e-12) < enough(0.01)
+
+
+def test_what_validation_runs_say_is_the_share_that_is_told():
+    """Of a force that pushes in no test run: the share of their gap would be one of nothing."""
+
+    def runs(push):
+        drawn = (np.random.default_rng(i) for i in range(8))
+        rides = [ride(rng, 200, lambda *_: push, noise=[0.0005, 0.01], finer=4) for rng in drawn]
+        return [replace(log, name=f"run{i}") for i, log in enumerate(rides)]
+
+    pushed, calm = runs(0.08), runs(0.0)
+    test = {log.name for log in split(pushed)["test"]}
+    logs = [calm[i] if log.name in test else log for i, log in enumerate(pushed)]
+    report = diagnose(cart(), None, logs, effects=("constant_force", "viscous_friction"))
+    assert "on validation runs" in str(report)
+    (force,) = report.effects
+    assert force.share_of_gap == pytest.approx(report.gap.explained_fraction)
+    assert report.gap.explained_fraction > 0.9
+    assert report.gap.ci95 == (0.0, 1.0)

@@ -42,6 +42,7 @@ from .wavering import wavering_alarms
 from .whole_runs import whole_run_alarm
 
 Array = NDArray[np.float64]
+_UNTOLD = 0.0, 1.0  # interval of a share that test runs say nothing of
 _TOLD: tuple[str, ...] = "at the prior's mean", "with fitted parameters", "with the effects"
 
 
@@ -90,7 +91,7 @@ def assemble(
     units = _every_unit(selection, scatter)
     errors = run_errors(prepared.sets, prepared.logs, best.fit.point)
     by_integration = numerical(found.effects, system.robot)
-    verdict, summary, more = conclude(
+    verdict, summary, more, validated = conclude(
         system,
         prepared,
         selection=selection,
@@ -113,6 +114,7 @@ def assemble(
         ],
         alpha=alpha,
     )
+    found = _on_validation(found, credit, validated)
     if verdict == "none":
         more += whole_run_alarm(prepared, points["refit"])
         more += unexplained_run_alarms(
@@ -153,7 +155,7 @@ def assemble(
         confusion_set=found.confused,
         where=where,
         remainder=remainder,
-        gap=_gap(found.measured, prepared, rollouts),
+        gap=_gap(found.measured, prepared, rollouts, validated=validated),
         candidates=seen,
         parameters=parameters,
         alarms=tuple(alarms),
@@ -196,15 +198,32 @@ def _absorbed(parameters: Sequence[Parameter]) -> list[str]:
     ]
 
 
-def _gap(measured: Shrinkage, prepared: Prepared, rollouts: Mapping[str, Any]) -> Gap:
+def _on_validation(found: Found, credit: Mapping[str, float], explained: float | None) -> Found:
+    """Return what was found with shares by credit, where validation runs say what it explains."""
+    each = [credit.get(effect.name, 0.0) for effect in found.effects]
+    if explained is None or sum(each) <= 0:
+        return found
+    shares = [explained * part / sum(each) for part in each]
+    parts = zip(found.effects, shares, strict=True)
+    return replace(found, effects=tuple(replace(e, share_of_gap=share) for e, share in parts))
+
+
+def _gap(
+    measured: Shrinkage,
+    prepared: Prepared,
+    rollouts: Mapping[str, Any],
+    *,
+    validated: float | None,
+) -> Gap:
+    told = validated is None
     return Gap(
         horizon_steps=prepared.horizon,
         raw=measured.raw,
         refit=measured.refit,
         with_effects=measured.effects,
         floor=1.0,
-        explained_fraction=measured.explained,
-        ci95=measured.elsewhere,
+        explained_fraction=measured.explained if told else validated,
+        ci95=measured.elsewhere if told else _UNTOLD,
         by_parameters=measured.by_parameters,
         rollout_rmse=rollouts,
     )

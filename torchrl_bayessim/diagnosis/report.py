@@ -128,7 +128,8 @@ class Gap:
         refit: With the parameters fitted.
         with_effects: With the effects too.
         floor: Of a perfect simulator.
-        explained_fraction: ``(refit - with_effects) / (refit - floor)`` on the test split.
+        explained_fraction: ``(refit - with_effects) / (refit - floor)`` on the test split; where
+            that hardly shows the gap, and the sentence says so, on the validation split.
         ci95: Its interval for motions that were not recorded: by bootstrap over trajectories, and
             wider by what robots whose cause was known had.
         by_parameters: ``(raw - refit) / (raw - floor)``.

@@ -68,8 +68,11 @@ def conclude(
     baseless: bool,
     doubts: Sequence[str],
     alpha: float,
-) -> tuple[Verdict, str, list[str]]:
-    """Return the verdict, the sentence, and further alarms.
+) -> tuple[Verdict, str, list[str], float | None]:
+    """Return the verdict, the sentence, further alarms, and what validation runs say.
+
+    The last is the share of the gap that is explained on these, where they speak for test runs that
+    hardly show the gap, and nothing otherwise.
 
     Args:
         system: The robot.
@@ -109,6 +112,7 @@ def conclude(
         verdict = "unknown"
     names = verdict.startswith("named") or verdict == "ambiguous"
     alarms = [obstacle[0]] if obstacle else [*doubts] if names else []
+    validated = weighed.validated if weighed.elsewhere and verdict == "named_partial" else None
     text = sentence(
         verdict,
         system,
@@ -117,12 +121,12 @@ def conclude(
         effects=effects,
         candidates=candidates,
         confused=confused,
-        validated=weighed.validated if weighed.elsewhere else None,
+        validated=validated,
         where=where,
         odd=odd,
         hint=obstacle[1] if obstacle else "",
     )
-    return verdict, text, alarms
+    return verdict, text, alarms, validated
 
 
 @dataclass(frozen=True)
