@@ -103,7 +103,7 @@ def test_where_nothing_touches_the_linear_view_misses_nothing(monkeypatch):
     np.testing.assert_array_equal(noise, linear)
 
 
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", [3, 7])
 def test_a_sensor_as_good_as_its_spec_is_no_alarm(seed):
     *_, spec = cheetah()
     system, logs, _ = cheetah(noise=spec, amplitude=1.0, seed=seed)

@@ -121,7 +121,8 @@ def _corrected(
     noise = linear
     for _ in range(_CORRECTIONS):
         at, factor = _round(predictor, pieces, at, noise, drawn=True)
-        noise = np.clip(noise * factor, _least(linear, known), _MOST_MISSED * linear)
+        # no more than before: where little is calm, what a missing effect does would count as noise
+        noise = np.clip(noise * factor, _least(linear, known), linear)
         noise = np.minimum(noise, _most(noise, known, predictor.system.robot))
         if _settled(factor):
             break
