@@ -29,6 +29,7 @@ _BEYOND = 3.0  # times its spec, or its like, that a sensor is not noisier than
 _ROUGHLY = 2.0  # times what third differences say
 _LIKE = 3  # sensors of one kind
 _DRAWS = 8  # simulated robots whose noise is known
+_HARDLY = 0.15  # of the noise: a correction that is hardly known
 _MOST_MISSED = 1.6  # the most by which contacts make it seem larger than it is
 
 
@@ -126,7 +127,7 @@ def _corrected(
         noise = np.minimum(noise, _most(noise, known, predictor.system.robot))
         if _settled(factor):
             break
-    return noise
+    return np.where(noise < (1 - _HARDLY) * linear, noise, linear)
 
 
 def _settled(factor: Array) -> bool:
