@@ -11,10 +11,13 @@ from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.system import System
 
 
-def cheetah(*, noise=None, stiffness=0.0, amplitude=0.5, lost=0.0, shaken=0.0, runs=4, seed=0):
+def cheetah(
+    *, noise=None, stiffness=0.0, amplitude=0.5, lost=0.0, late=0.0, shaken=0.0, runs=4, seed=0
+):
     """Return HalfCheetah, logs of one with a spring more, and the logs' noise.
 
-    Or of one that loses commands of its back shin, or whose back foot is shaken, at four hertz.
+    Or of one that loses commands of its back shin, whose are late by up to a part of a step each,
+    or whose back foot is shaken, at four hertz.
     """
     task = known_task("HalfCheetah-v5")
     model, rng, logs = copy.copy(task.model), np.random.default_rng(seed), []
@@ -25,8 +28,10 @@ def cheetah(*, noise=None, stiffness=0.0, amplitude=0.5, lost=0.0, shaken=0.0, r
         commands = amplitude * rng.uniform(-1, 1, (80, model.nu))
         for u in commands:
             rows.append(np.r_[data.qpos, data.qvel] + true * rng.standard_normal(2 * model.nv))
-            held = data.ctrl[1]
+            held, before = data.ctrl[1], commands[max(len(rows) - 2, 0), 1]
             data.ctrl[:] = u
+            if late:
+                data.ctrl[1] += rng.uniform(0.0, late) * (before - u[1])
             if lost and rng.random() < lost:
                 data.ctrl[1] = held
             for _ in range(task.frame_skip):

@@ -14,7 +14,16 @@ leaves errors too, so an effect of chance must leave noise alone by its own stan
 
 from __future__ import annotations
 
-__all__ = ["Chance", "chances", "detectable", "drawn", "of_chance", "scattered", "unseen"]
+__all__ = [
+    "Chance",
+    "calm",
+    "chances",
+    "detectable",
+    "drawn",
+    "of_chance",
+    "scattered",
+    "unseen",
+]
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -24,8 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..effects.effect import SensorEffect
+from .moved_innovations import Judged, Moved, Told, deviances_without, tell
 from .objective import Objective, Point, Unit, strengths_of
-from .refit import refit
 from .screening import crossing
 from .selection import Selection
 
@@ -36,7 +45,6 @@ _LEVELS = (0.08, 0.2, 0.45, 1.0)  # of an effect's range
 _FINER = np.geomspace(_LEVELS[0], _LEVELS[-1], 10)
 _LATE = "timing"  # the group of effects that are late
 _AROUND = (0.65, 0.8, 1.25, 1.55)  # times the best of these
-_SCATTER = np.geomspace(0.6, 4.0, 20)  # φ
 _WHITE = 1.15  # mean squared innovation of a model that leaves nothing to chance
 _CALM = 1.3  # φ beyond which an effect of chance has not explained the scatter
 _SEGMENTS = 8  # of each split
@@ -60,6 +68,7 @@ class Chance:
             than those of the other figures.
         beside: Whether it acts beside the best explanation without chance, not in its place.
         deviance: Of the segments that say what is lost, with it; infinite where others do.
+        alone: Mean of ``left`` without the effects that it acts beside, where that was looked at.
     """
 
     unit: Unit
@@ -70,43 +79,7 @@ class Chance:
     before: float | None = None
     beside: bool = False
     deviance: float = np.inf
-
-
-@dataclass(frozen=True, eq=False)
-class _Data:
-    """Some segments: innovations of the nominal fit, ``(S, M)``, and derivatives."""
-
-    objective: Objective
-    left: Array
-    derivatives: Array
-
-    @classmethod
-    def of(cls, objective: Objective, point: Point) -> _Data:
-        """Return the data of a split, on some segments."""
-        every = max(1, len(objective.segments) // _SEGMENTS)
-        some = objective.take(np.arange(0, len(objective.segments), every))
-        fit = refit(some, [Point(point.z)], iterations=0)[0]
-        weights = some.whitening.weights[:, None]
-        derivatives = fit.jacobian.reshape(*fit.innovations.shape, -1) / weights[..., None]
-        return cls(some, fit.innovations / weights, derivatives)
-
-    def draws(self, points: Sequence[Point], count: int = _DRAWS) -> Array:
-        """Return what chance changes, shape ``(P, R, S, M)``."""
-        return drawn(self.objective, points, count) - self.left
-
-
-@dataclass(frozen=True, eq=False)
-class _Told:
-    """What the judged segments say of a point: ``δ``, their deviances, the largest ``φ``."""
-
-    change: Array
-    costs: Array
-    scatter: float
-
-    @property
-    def cost(self) -> float:
-        """The deviance of all."""
-        return float(self.costs.sum())
+    alone: float | None = None
 
 
 def of_chance(units: Sequence[Unit]) -> list[Unit]:
@@ -126,13 +99,14 @@ def detectable(train: Objective, selection: Selection, units: Sequence[Unit]) ->
 
     The mean squared innovation that it adds must reach what calls for an effect of chance.
     """
-    data, z = _Data.of(train, selection.nominal.fit.point), selection.nominal.fit.point.z
+    z = selection.nominal.fit.point.z
+    data = Judged.of(train, Point(z), _SEGMENTS)
     threshold, result = _WHITE - 1.0, {}
     for unit in units:  # one after the other, for memory's sake
         levels, added = np.array(_LEVELS) * unit.high, np.zeros(0)
         for some in (levels[:2], *levels[2:, None]):  # as far as it takes
             points = [Point(z, {unit: float(level)}) for level in some]
-            added = np.r_[added, (data.draws(points, _FEW) ** 2).mean((1, 2, 3))]
+            added = np.r_[added, (_draws(data, points, _FEW) ** 2).mean((1, 2, 3))]
             if added[-1] >= threshold:
                 break
         result[unit] = crossing(levels[: len(added)], added, threshold)
@@ -151,11 +125,11 @@ def chances(
         selection: What the search without chance found.
         units: Random effects at their targets.
     """
-    if not units or _calm(selection):
+    if not units or calm(selection):
         return []
     point = selection.nominal.fit.point
-    judged = [_Data.of(sets[name], point) for name in ("train", "validation")]
-    base = _without(judged, selection.best.fit.point)
+    judged = [Judged.of(sets[name], point, _SEGMENTS) for name in ("train", "validation")]
+    base = deviances_without(judged, selection.best.fit.point)
     best = _likeliest(judged, point, [(u, level * u.high) for u in units for level in _LEVELS])
     least = min(cost for cost, _ in best.values())
     if base.sum() - least < _NEEDED:
@@ -187,14 +161,14 @@ def unseen(sets: Mapping[str, Objective], selection: Selection, units: Sequence[
     if not found or not alike or any(unit.effect.group != _LATE for unit in found):
         return []
     point = selection.nominal.fit.point
-    judged = [_Data.of(sets[name], point) for name in ("train", "validation")]
-    most = float(_without(judged, selection.best.fit.point).sum()) + _LIKELY
+    judged = [Judged.of(sets[name], point, _SEGMENTS) for name in ("train", "validation")]
+    most = float(deviances_without(judged, selection.best.fit.point).sum()) + _LIKELY
     best = _likeliest(judged, point, [(u, level * u.high) for u in alike for level in _FINER])
     return list(dict.fromkeys(unit.name for unit, (cost, _) in best.items() if cost < most))
 
 
 def _likeliest(
-    judged: Sequence[_Data], point: Point, rows: Sequence[tuple[Unit, float]]
+    judged: Sequence[Judged], point: Point, rows: Sequence[tuple[Unit, float]]
 ) -> dict[Unit, tuple[float, float]]:
     """Return the least deviance of each unit over strengths, and the strength that has it."""
     told = _told(judged, [Point(point.z, {unit: strength}) for unit, strength in rows])
@@ -204,48 +178,22 @@ def _likeliest(
     return best
 
 
-def _calm(selection: Selection) -> bool:
+def calm(selection: Selection) -> bool:
+    """Return whether what was found leaves noise alone, and is not late itself."""
     best = selection.best
     if any(unit.effect.group == _LATE for unit in best.units):
         return False  # what varies is late on average
     return max(best.fit.mean_square, best.dispersion()) < _WHITE
 
 
-def _without(judged: Sequence[_Data], point: Point) -> Array:
-    """Return deviances of an explanation without chance, of evenly spread scatter, by segment."""
-    left = [(data.objective.unweighted([point])[0] ** 2) for data in judged]
-    squares = np.concatenate([r.sum(-1) for r in left])
-    size = np.concatenate([np.full(len(r), r.shape[1]) for r in left])
-    costs = squares / _SCATTER[:, None] + size * np.log(_SCATTER)[:, None]
-    return np.asarray(costs[costs.sum(1).argmin()])
+def _told(judged: Sequence[Judged], points: Sequence[Point]) -> list[Told]:
+    made = [_draws(data, points) for data in judged]
+    return [tell(judged, [Moved.by(draws[p]) for draws in made]) for p in range(len(points))]
 
 
-def _told(judged: Sequence[_Data], points: Sequence[Point]) -> list[_Told]:
-    made = [data.draws(points) for data in judged]
-    told = []
-    for p in range(len(points)):
-        change = _change(judged[0], made[0][p])
-        found = [_deviance(data, d[p], change) for data, d in zip(judged, made, strict=True)]
-        costs = np.concatenate([cost for cost, _, _ in found])
-        told.append(_Told(change, costs, max(phi for _, phi, _ in found)))
-    return told
-
-
-def _change(data: _Data, drawn: Array) -> Array:
-    """Return ``δ``, how the parameters move beside an effect of chance, by draws ``(R, S, M)``."""
-    values, vectors = _spectrum(drawn)
-    error = data.left + drawn.mean(0)
-
-    def weighed(columns: Array) -> Array:
-        inside = np.einsum("srm,smd->srd", vectors, columns)
-        shrunk = (1 - 1 / np.sqrt(1 + values))[..., None] * inside
-        return columns - np.einsum("srm,srd->smd", vectors, shrunk)
-
-    derivatives = weighed(data.derivatives).reshape(-1, data.derivatives.shape[-1])
-    target = weighed(error[..., None]).reshape(-1)
-    normal = derivatives.T @ derivatives + np.eye(derivatives.shape[1])
-    change = -np.linalg.solve(normal, derivatives.T @ target)
-    return np.asarray(change, dtype=np.float64)
+def _draws(data: Judged, points: Sequence[Point], count: int = _DRAWS) -> Array:
+    """Return what chance changes, shape ``(P, R, S, M)``."""
+    return drawn(data.objective, points, count) - data.left
 
 
 def drawn(objective: Objective, points: Sequence[Point], count: int) -> Array:
@@ -267,31 +215,8 @@ def scattered(draws: Array) -> Array:
     return np.asarray((draws - draws.mean(0)).transpose(1, 0, 2) / np.sqrt(len(draws) - 1))
 
 
-def _spectrum(drawn: Array) -> tuple[Array, Array]:
-    """Return eigenvalues ``(S, R)`` and eigenvectors ``(S, R, M)`` of what chance scatters."""
-    _, roots, vectors = np.linalg.svd(scattered(drawn), full_matrices=False)
-    return roots**2, vectors
-
-
-def _deviance(data: _Data, drawn: Array, change: Array) -> tuple[Array, float, Array]:
-    """Return least deviances over ``φ``, that ``φ``, and mean squares for ``φ = 1``, ``(S,)``."""
-    values, vectors = _spectrum(drawn)
-    error = data.left + drawn.mean(0) + data.derivatives @ change
-    inside = np.einsum("srm,sm->sr", vectors, error) ** 2
-    beside = np.maximum((error**2).sum(-1) - inside.sum(-1), 0.0)
-    free = error.shape[1] - values.shape[1]
-    costs = [
-        (inside / (phi + values) + np.log(phi + values)).sum(-1)
-        + (beside / phi + free * np.log(phi))
-        for phi in _SCATTER
-    ]
-    standard = ((inside / (1 + values)).sum(-1) + beside) / error.shape[1]
-    best = int(np.argmin([cost.sum() for cost in costs]))
-    return costs[best], float(_SCATTER[best]), standard.astype(np.float64)
-
-
 def _refined(
-    judged: Sequence[_Data],
+    judged: Sequence[Judged],
     test: Objective,
     unit: Unit,
     strength: float,
@@ -313,9 +238,9 @@ def _refined(
     everywhere = gains.mean() > _SURE * gains.std(ddof=1) / np.sqrt(len(gains))
     if told[best].scatter > _CALM or not everywhere:
         return None
-    unseen = _Data.of(test, point)
-    drawn = unseen.draws([points[best]], _MANY)[0]
-    after = _deviance(unseen, drawn, told[best].change)[2]
+    unseen = Judged.of(test, point, _SEGMENTS)
+    moved = Moved.by(_draws(unseen, [points[best]], _MANY)[0])
+    after = moved.deviances(unseen, told[best].change)[1]
     return Chance(
         unit=unit,
         strength=float(strengths[best]),

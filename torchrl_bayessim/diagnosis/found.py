@@ -89,7 +89,8 @@ def _with_chance(
 ) -> Found:
     """Return the same with the effects of chance, beside those that last or in their place."""
     if scatter.sent is not None:
-        return _with_arrivals(found, scatter, scatter.sent, robot)
+        arrived = scatter.scattered(found.measured, generator)
+        return _with_arrivals(replace(found, measured=arrived), scatter, scatter.sent, robot)
     if scatter.beside:
         measured = scatter.measured(found.measured, generator)
         if _matters(scatter, found.measured, measured):
@@ -140,7 +141,7 @@ def _with_holds(found: Found, scatter: Scatter) -> Found:
 
 
 def _with_arrivals(found: Found, scatter: Scatter, sent: Sent, robot: Robot) -> Found:
-    """Return the same with commands that were lost, of the gap with those that were sent."""
+    """Return the same with commands that were lost or late, of the gap with those sent."""
     measured = scatter.with_arrivals(found.measured, sent)
     others = (1.0 - sent.share(found.measured)) * measured.explained
     total = max(sum(effect.share_of_gap for effect in found.effects), 1e-9)

@@ -194,6 +194,13 @@ class Scatter:
             remainder_ci=(low - 1.0, high - 1.0),
         )
 
+    def scattered(self, before: Shrinkage, generator: np.random.Generator) -> Shrinkage:
+        """Return the same by the scatter of the likeliest, where that has one of its own."""
+        alone = self.found[0].alone
+        if alone is None:
+            return before
+        return replace(self.measured(before, generator), refit=min(alone, before.refit))
+
     def with_holds(self, before: Shrinkage) -> Shrinkage:
         """Return how far the gap of the samples as they were recorded shrinks."""
         refit = max(self.recorded, before.refit)
@@ -295,7 +302,8 @@ class Scatter:
 
     def candidates(self, robot: Robot) -> list[Candidate]:
         """Return what the data say of each that was looked for."""
-        return [self._candidate(unit, least, robot) for unit, least in self.least.items()]
+        every = dict.fromkeys((chance.unit for chance in self.found), np.inf) | dict(self.least)
+        return [self._candidate(unit, least, robot) for unit, least in every.items()]
 
     def _candidate(self, unit: Unit, least: float, robot: Robot) -> Candidate:
         strength, error, gain = self._known(unit)

@@ -18,7 +18,7 @@ with the likeliest unit and size (random coefficients, Swamy 1970; a synthetic l
 
 from __future__ import annotations
 
-__all__ = ["Varying", "varying", "with_variation"]
+__all__ = ["Varying", "varying", "widened", "with_variation"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -99,11 +99,16 @@ def with_variation(prepared: Prepared, found: Varying) -> Prepared:
         prepared: With noise alone.
         found: What varies.
     """
+    return widened(prepared.alarmed(_NOTE.format(found.what)), found.roots)
+
+
+def widened(prepared: Prepared, roots: Mapping[str, Array]) -> Prepared:
+    """Return the same with a covariance of some splits that is wider, by roots ``(S, M, R)``."""
     sets = dict(prepared.sets)
-    for name, roots in found.roots.items():
-        sets[name] = _widened(sets[name], roots)
+    for name, root in roots.items():
+        sets[name] = _widened(sets[name], root)
     nominal = refit(sets["train"], [prepared.nominal.point], iterations=_AGAIN)[0]
-    return replace(prepared.alarmed(_NOTE.format(found.what)), sets=sets, nominal=nominal)
+    return replace(prepared, sets=sets, nominal=nominal)
 
 
 def _wavering(sets: Mapping[str, Objective], point: Point, unit: Unit) -> list[Varying]:

@@ -9,9 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..effects.action import PacketDrop
 from ..logs.log import Log
+from .beside_jitter import beside_jitter, outdone
 from .beside_losses import Sought
-from .chance import chances, detectable, of_chance, unseen
+from .chance import Chance, chances, detectable, of_chance, unseen
 from .holds import Hold
 from .loss_suspects import Suspects
 from .losses import losses
@@ -64,6 +66,11 @@ def with_chance(
         sought = Sought(seen, selection, found, suspects, search, generator)
         if beside := beside_lost_commands(sought) or beside_lost_samples(sought):
             prepared, selection, found, sent = beside.told()
+    if not holds and sent is None and _may_be_jitter(suspects, found, units):
+        shaken = beside_jitter(prepared, selection, units, search=search, generator=generator)
+        if shaken is not None:
+            prepared, selection, sent = shaken.prepared, shaken.selection, shaken.sent
+            found = [shaken.chance]
     found = found or chances(prepared.sets, selection, random)
     if sent is None and not holds and not any(chance.beside for chance in found):
         prepared, more = _beside_variation(search, prepared, selection, random)
@@ -72,6 +79,14 @@ def with_chance(
     least = detectable(prepared.sets["train"], selection, random)
     hidden = [] if found else unseen(prepared.sets, selection, random)
     return prepared, selection, Scatter(found, least, holds, recorded, hidden, sent)
+
+
+def _may_be_jitter(
+    suspects: Suspects | None, found: Sequence[Chance], units: Sequence[Unit]
+) -> bool:
+    """Return whether nothing was lost, or jitter is likelier than losses of commands."""
+    commands = all(isinstance(one.unit.effect, PacketDrop) for one in found)
+    return commands and (suspects is None or not found or outdone(suspects, found, units))
 
 
 def _beside_variation(

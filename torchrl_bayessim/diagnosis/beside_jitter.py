@@ -1,0 +1,264 @@
+"""Jitter of commands, in the place of what is late or beside what lasts.
+
+Jitter is a delay on average, so what is late is taken out of the explanation that was found, and
+jitter put in its place. A delay that is the same for each command, or nearly so, is likelier beside
+a little jitter than jitter alone; and what pushes by itself is likelier as such. Then all that
+lasts is looked for again: with the commands that act on average, and with their scatter as noise,
+since jitter that nobody knows of hides the rest and calls for stopgaps.
+"""
+
+from __future__ import annotations
+
+__all__ = ["Shaken", "beside_jitter", "outdone"]
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..effects.action import ActionJitter
+from ..logs.log import Log
+from .chance import Chance, calm
+from .jitter import Jitter, Responses, jitter, moments, shaken
+from .loss_suspects import Suspects
+from .model import Model, judged_fits
+from .modes import Mode
+from .moved_innovations import deviances_without
+from .objective import Objective, Point, Unit
+from .preparation import Prepared, Started
+from .scatter import Sent
+from .selection import Selection
+from .varying import widened
+
+Array = NDArray[np.float64]
+_JUDGED = "train", "validation"
+_SEGMENTS, _FEW = 40, 8  # of each split, and to see whether it is worth a closer look
+_NEEDED, _CERTAIN = 10.0, 40.0  # deviance, on a few segments and on all
+_LIKELY = 6.0  # deviance that chance often makes
+_PLAINLY = 0.2  # of what losses gain: by how much jitter has to be likelier
+_ROUGH = 0.2  # of what jitter gains beside what is late: by how much it may be worse in its place
+_SURE = 1.5  # standard errors of segments by which the mean gain exceeds zero
+_CALM = 1.3  # φ beyond which jitter has not explained the scatter
+_AGAIN = 4  # steps of a fit without what is late
+_NOTE = (
+    "commands at {} are taken to arrive as late as jitter makes them on average, and its scatter "
+    "as noise; causes beside it were looked for so"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Shaken:
+    """What was found of jitter, and beside it.
+
+    Attributes:
+        prepared: With the commands that act on average; as it was where jitter is all there is.
+        selection: The effects that last beside it; as it was where there are none.
+        chance: The jitter.
+        sent: Figures of the commands as they were sent; none where jitter is all there is.
+    """
+
+    prepared: Prepared
+    selection: Selection
+    chance: Chance
+    sent: Sent | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Jitter in the place of what is late.
+
+    Attributes:
+        base: What lasts beside it.
+        jitter: Where and how much.
+        without: Deviances by segment of what was found without it.
+    """
+
+    base: Model
+    jitter: Jitter
+    without: Array
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether it explains more than a few segments: what chance does, it does everywhere."""
+        gains = self.without - self.jitter.told.costs
+        return bool(gains.mean() > _SURE * gains.std(ddof=1) / np.sqrt(len(gains)))
+
+
+def beside_jitter(
+    prepared: Prepared,
+    selection: Selection,
+    units: Sequence[Unit],
+    *,
+    search: Callable[..., tuple[Prepared, Selection]],
+    generator: np.random.Generator,
+) -> Shaken | None:
+    """Return jitter, and what lasts beside it, if they explain more than what was found.
+
+    Args:
+        prepared: What the search started from.
+        selection: What it found.
+        units: Effects at their targets, jitter among them.
+        search: Searches for effects that last.
+        generator: Of simulated noise.
+    """
+    units = [unit for unit in units if isinstance(unit.effect, ActionJitter)]
+    if not units or calm(selection) or type(prepared.mode) is not Mode:
+        return None
+    seen = _seen(prepared, selection, units)
+    if seen is None:
+        return None
+    again = _with_jitter(prepared, seen, generator)
+    _, more = search(again, known=_without_late(selection, seen.base), varied=True)
+    found = seen
+    if more.best.units != seen.base.units:
+        judged = _judged(prepared, more.best.fit.point, _SEGMENTS)
+        found = _Seen(more.best, jitter(judged, units), seen.without)
+        if found.jitter.cost > seen.jitter.cost - _LIKELY:
+            sets = again.sets["train"], again.sets["validation"]
+            base = judged_fits(*sets, [seen.base.fit.point], iterations=_AGAIN)[0]
+            found, more = seen, more.reduced(base)
+    if found.jitter.told.scatter > _CALM or not found.everywhere:
+        return None
+    return _told(prepared, again, found, before=selection, more=more)
+
+
+def outdone(suspects: Suspects, found: Sequence[Chance], units: Sequence[Unit]) -> bool:
+    """Return whether jitter explains more than losses of commands, in the segments that have them.
+
+    Args:
+        suspects: Short segments.
+        found: Losses of commands.
+        units: Effects at their targets, jitter among them.
+    """
+    units = [unit for unit in units if isinstance(unit.effect, ActionJitter)]
+    if not units:
+        return False
+    segments = suspects.best if found[0].beside else suspects.nominal
+    each = [segments[name] for name in _JUDGED]
+    judged = [Responses.of(one.objective, one.point, len(one.left)) for one in each]
+    likeliest, losses = jitter(judged, units), min(found, key=lambda one: one.deviance)
+    # losses in bursts are not what losses are taken for either
+    margin = max(_CERTAIN, _PLAINLY * losses.gain)
+    return likeliest.cost < losses.deviance - margin
+
+
+def _seen(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> _Seen | None:
+    """Return jitter in the place of what is late, if it explains more, and nothing else does so."""
+    best = selection.best
+    for base in _bases(prepared, selection):
+        few = _judged(prepared, base.fit.point, _FEW)
+        without = _without(few, best)
+        likeliest = min(units, key=lambda unit: jitter(few, [unit]).cost)
+        if jitter(few, [likeliest]).cost > without.sum() - _NEEDED:
+            continue
+        judged = _judged(prepared, base.fit.point, _SEGMENTS)
+        found = _Seen(base, jitter(judged, units), _without(judged, best))
+        gained = found.without.sum() - found.jitter.cost
+        if gained < _CERTAIN or found.jitter.cost > shaken(judged, found.jitter.unit):
+            continue
+        if base is not best:
+            late = _judged(prepared, best.fit.point, _SEGMENTS)
+            beside = jitter(late, [found.jitter.unit]).cost
+            slack = max(_LIKELY, _ROUGH * (found.without.sum() - beside))
+            if found.jitter.cost > beside + slack:
+                continue
+        return found
+    return None
+
+
+def _bases(prepared: Prepared, selection: Selection) -> list[Model]:
+    """Return what was found without what is late, and parameters alone: all may make up for it."""
+    best = selection.best
+    kept = {u: s for u, s in best.fit.point.strengths.items() if not _late(u)}
+    if len(kept) == len(best.units):
+        return [best] if not kept else [best, selection.nominal]
+    if not kept:
+        return [selection.nominal]
+    point = Point(best.fit.point.z, kept)
+    sets = prepared.sets["train"], prepared.sets["validation"]
+    return [*judged_fits(*sets, [point], iterations=_AGAIN), selection.nominal]
+
+
+def _late(unit: Unit) -> bool:
+    return unit.effect.group == ActionJitter.group
+
+
+def _judged(prepared: Prepared, point: Point, most: int) -> list[Responses]:
+    return [Responses.of(prepared.sets[name], point, most) for name in _JUDGED]
+
+
+def _without(judged: Sequence[Responses], best: Model) -> Array:
+    return deviances_without([one.judged for one in judged], best.fit.point)
+
+
+def _without_late(selection: Selection, base: Model) -> Selection:
+    """Return where a search goes on from, without what is late: of one kind with jitter."""
+    offered = tuple(unit for unit in selection.offered if not _late(unit))
+    tried = tuple(m for m in selection.tried if not any(_late(unit) for unit in m.units))
+    return replace(selection, best=base, tried=tried, offered=offered)
+
+
+def _with_jitter(prepared: Prepared, seen: _Seen, generator: np.random.Generator) -> Prepared:
+    """Return the logs with the commands that act on average, and a covariance so much wider."""
+    unit, strength = seen.jitter.unit, seen.jitter.strength
+    dt = prepared.predictor.system.control_dt
+    logs = {
+        name: [_on_average(log, unit, strength / dt) for log in part]
+        for name, part in prepared.logs.items()
+    }
+    predictor = prepared.predictor.divided(prepared.predictor.substeps)  # searches change theirs
+    predictor.steps = prepared.predictor.steps
+    history = prepared.sets["train"].segments.history
+    started = Started(
+        predictor, prepared.mode, history, prepared.horizon, prepared.noise,
+        prepared.noise_source, prepared.alarms,
+    )  # fmt: skip
+    again = started.fitted(logs, generator)
+    roots = {}
+    for name in _JUDGED:
+        train = again.sets[name]
+        moved = Responses.of(train, seen.base.fit.point, len(train.segments)).moved(unit, strength)
+        roots[name] = moved.vectors * np.sqrt(moved.values)[:, None]
+    return widened(again.alarmed(_NOTE.format(unit.where)), roots)
+
+
+def _on_average(log: Log, unit: Unit, steps: float) -> Log:
+    """Return a log with the commands that act on average, the first ones as they are."""
+    ctrl = log.ctrl.numpy().copy()
+    for target in unit.targets:
+        most = unit.direction[target] * steps
+        first = int(np.ceil(most)) + 1
+        rows = np.arange(first, len(ctrl))
+        ctrl[first:, target] += moments(log.ctrl.numpy()[None, :, target], rows, most)[0][0]
+    return replace(log, ctrl=torch.from_numpy(ctrl))
+
+
+def _told(
+    prepared: Prepared, again: Prepared, found: _Seen, *, before: Selection, more: Selection
+) -> Shaken:
+    jittered, test = found.jitter, prepared.sets["test"]
+    after, mean = _left(test, found.base.fit.point, jittered)
+    chance = Chance(
+        unit=jittered.unit,
+        strength=jittered.strength,
+        error=jittered.error,
+        gain=float(found.without.sum() - jittered.cost),
+        left=after,
+    )
+    if not more.best.units:
+        return Shaken(prepared, before, chance, None)
+    alone = float(_left(test, more.nominal.fit.point, jittered)[0].mean())
+    chance = replace(chance, before=mean, beside=True, alone=alone)
+    return Shaken(again, more, chance, Sent.along(again, prepared, more))
+
+
+def _left(test: Objective, point: Point, jittered: Jitter) -> tuple[Array, float]:
+    """Return mean squares of test segments by the scatter of jitter, and with its mean alone."""
+    one = Responses.of(test, point, len(test.segments))
+    moved = one.moved(jittered.unit, jittered.strength)
+    size, change = one.judged.derivatives.shape[-1], jittered.told.change
+    change = change if len(change) == size else np.zeros(size)  # of this point, or another
+    error = one.judged.left + moved.mean + one.judged.derivatives @ change
+    return moved.deviances(one.judged, change)[1], float((error**2).mean())
