@@ -2,7 +2,8 @@
 
 A noisy measurement never repeats to the last digit, so a value that does was held. Its share is the
 strength of ``sensor_dropout``; its error, what the robot moved meanwhile, is nobody else's. Values
-on a lattice, as encoders give them, repeat by themselves, and say nothing.
+on a lattice, as encoders give them, repeat by themselves, and say nothing. Where noise is added to
+what is held, measured velocities may tell (`holds_in_noise`).
 """
 
 from __future__ import annotations
@@ -21,11 +22,16 @@ from ..logs.finding import runs
 from ..logs.kinematics import lattice_step
 from ..logs.log import Log
 from ..logs.velocity import Windows, velocity
+from .holds_in_noise import HeldSamples, held_in_noise, with_motion
 
 _LEAST, _ROWS = 0.01, 10  # share of the rows, and rows, that are no accident
 _MOST = 0.6  # share beyond which the channel is sampled more slowly
 _MOVING = 0.2  # of the mean change: what a moving joint's neighbouring samples differ by
 _EQUAL = 0.3  # of the variance by chance
+_NOTE = (
+    "{} of {} samples of {} are taken not to have been renewed, and put where measured velocities "
+    "lead"
+)
 _LONGEST = 12  # rows: a sample that stands still for longer is of a robot that does
 
 
@@ -60,26 +66,31 @@ def bridged(logs: Sequence[Log], robot: Robot) -> tuple[list[Log], list[Hold], l
             continue
         name = "qpos" if kind == "position" else "qvel"
         index = (robot.qpos_index if kind == "position" else robot.dof_index)[joint]
+        dof = robot.dof_index[joint]
         columns = [getattr(log, name)[:, index].numpy() for log in result]
-        held = [_held(column) for column in columns]
-        rows, count = sum(int(h.sum()) for h in held), sum(len(h) - 1 for h in held)
-        share = rows / max(count, 1)
-        moving = sum(_moving(column, h) for column, h in zip(columns, held, strict=True))
-        if moving < max(_ROWS, _LEAST * count) or share > _MOST:
+        held, speeds = _to_the_digit(columns), None
+        if kind == "position" and not held.share:
+            in_noise = _in_noise(result, index, dof)
+            held, speeds = (held, None) if in_noise is None else (in_noise, dof)
+        moving = sum(_moving(column, h) for column, h in zip(columns, held.rows, strict=True))
+        if moving < max(_ROWS, _LEAST * held.count) or held.share > _MOST:
             continue
-        if _regular(held, share):
+        if _regular(held.rows, held.share):
             alarms.append(
-                f"{channel} is renewed every {1 / (1 - share):.2g} rows: between them it was taken "
-                "to go straight"
+                f"{channel} is renewed every {1 / (1 - held.share):.2g} rows: between them it was "
+                "taken to go straight"
             )
         else:
-            found.append(Hold(channel, share, float(np.sqrt(share * (1 - share) / count))))
+            error = float(np.sqrt(held.share * (1 - held.share) / held.count))
+            found.append(Hold(channel, held.share, error))
+            if speeds is not None:
+                rows = sum(int(h.sum()) for h in held.rows)
+                alarms.append(_NOTE.format(rows, sum(map(len, held.rows)), channel))
         result = [
-            _replaced(log, name, index, h) if h.any() else log
-            for log, h in zip(result, held, strict=True)
+            _replaced(log, name, index, h, speeds=speeds) if h.any() else log
+            for log, h in zip(result, held.rows, strict=True)
         ]
         if kind == "position":
-            dof = robot.dof_index[joint]
             result = [_slope(log, index, dof) for log in result]
     return result, found, alarms
 
@@ -113,10 +124,33 @@ def _moving(values: NDArray[np.float64], held: NDArray[np.bool_]) -> int:
     return int((held[1:-1] & (change[1:] > least) & (np.append(np.inf, change[:-2]) > least)).sum())
 
 
-def _replaced(log: Log, name: str, index: int, held: NDArray[np.bool_]) -> Log:
+def _to_the_digit(columns: Sequence[NDArray[np.float64]]) -> HeldSamples:
+    """Return which samples repeat the one before exactly."""
+    rows = [_held(column) for column in columns]
+    count = sum(len(h) - 1 for h in rows)
+    return HeldSamples(rows, sum(int(h.sum()) for h in rows) / max(count, 1), count)
+
+
+def _in_noise(logs: Sequence[Log], index: int, dof: int) -> HeldSamples | None:
+    """Return which samples are held where noise was added to them, by measured velocities."""
+    measured = all(bool(log.measured[log.qvel.shape[1] + dof]) for log in logs)
+    angles = [log.qpos[:, index].numpy() for log in logs]
+    if not measured or any(len(one) < _ROWS or lattice_step(one) > 0 for one in angles):
+        return None
+    dt = float(np.median(np.concatenate([np.diff(log.time.numpy()) for log in logs])))
+    return held_in_noise(angles, [log.qvel[:, dof].numpy() for log in logs], dt)
+
+
+def _replaced(
+    log: Log, name: str, index: int, held: NDArray[np.bool_], *, speeds: int | None
+) -> Log:
+    """Return a log with held samples on straight lines, or where measured velocities lead."""
     values, time = getattr(log, name).clone(), log.time.numpy()
     column = values[:, index].numpy()
-    column = np.interp(time, time[~held], column[~held])
+    if speeds is None:
+        column = np.interp(time, time[~held], column[~held])
+    else:
+        column = with_motion(column, log.qvel[:, speeds].numpy(), held, time)
     values[:, index] = torch.from_numpy(column)
     return replace(log, **{name: values})
 

@@ -1,0 +1,87 @@
+"""Held positions are told by measured velocities, though noise was added to them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from test_diagnose import logs, system
+from test_lost_values import shown_again
+
+from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.holds import bridged
+from torchrl_bayessim.diagnosis.holds_in_noise import held_in_noise, with_motion
+
+DT = 0.02
+
+
+def motion(seed=0, rows=300):
+    rng = np.random.default_rng(seed)
+    t = DT * np.arange(rows)
+    rates, sizes = rng.uniform(1, 6, 3), rng.normal(size=3)
+    return (sizes @ np.sin(np.outer(rates, t)), (sizes * rates) @ np.cos(np.outer(rates, t)), rng)
+
+
+def shown(angle, lost, rng, noise=1e-3):
+    last = np.maximum.accumulate(np.where(lost, 0, np.arange(len(angle))))
+    return angle[last] + noise * rng.standard_normal(len(angle))
+
+
+@pytest.mark.parametrize("share", [0.03, 0.15, 0.4])
+def test_most_held_samples_of_a_moving_joint_are_found_and_put_right(share):
+    data = []
+    for seed, rows in enumerate((300, 220, 300)):  # of several lengths
+        angle, speed, rng = motion(seed, rows)
+        lost = rng.random(rows) < share
+        lost[0] = False
+        data.append((angle, speed, lost, shown(angle, lost, rng)))
+    found = held_in_noise([one[3] for one in data], [one[1] for one in data], DT)
+    assert abs(found.share - share) < 3 * np.sqrt(share / found.count)
+    for (angle, speed, lost, seen), rows in zip(data, found.rows, strict=True):
+        moving = np.abs(speed) > 1.0
+        assert (rows != lost)[moving].mean() < 0.02
+        right = with_motion(seen, speed, rows, DT * np.arange(len(angle)))
+        before, after = (np.abs(one - angle)[moving].mean() for one in (seen, right))
+        assert after < min(0.7 * before, 2e-3)
+        assert np.array_equal(right[~rows], seen[~rows])
+
+
+def test_nothing_is_held_by_a_sensor_that_is_late_or_has_play_or_a_robot_that_is_struck():
+    angle, speed, rng = motion(1)
+    noise = 1e-3 * rng.standard_normal(len(angle))
+    assert held_in_noise([angle + noise], [speed], DT) is None
+    late = np.interp(np.arange(len(angle)) - 1.4, np.arange(len(angle)), angle)
+    assert held_in_noise([late + noise], [speed], DT) is None
+    play = angle.copy()
+    for k in range(1, len(play)):  # follows within 0.05
+        play[k] = np.clip(play[k - 1], angle[k] - 0.05, angle[k] + 0.05)
+    assert held_in_noise([play + noise], [speed], DT) is None
+    struck = speed * np.where(rng.random(len(speed)) < 0.1, rng.normal(size=len(speed)), 1.0)
+    assert held_in_noise([DT * np.cumsum(struck) + noise], [speed], DT) is None
+    still = np.zeros(50)
+    assert held_in_noise([still], [still], DT) is None
+
+
+def test_only_positions_beside_measured_velocities_are_looked_at():
+    rng = np.random.default_rng(2)
+    data = [shown_again(log, 0.2, rng) for log in logs(3)]
+    _, (hold,), (note,) = bridged(data, system().robot)
+    assert hold.share == pytest.approx(0.2, abs=3 * hold.error)
+    assert "samples of hinge position are taken not to have been renewed" in note
+    guessed = [replace(log, measured=torch.tensor([True, False])) for log in data]
+    same, holds, alarms = bridged(guessed, system().robot)
+    assert same == guessed
+    assert not holds
+    assert not alarms
+
+
+def test_friction_is_found_beside_them():
+    rng = np.random.default_rng(3)
+    data = logs(8, push=lambda q, v: -0.1 * np.tanh(v / 0.01))
+    data = [shown_again(log, 0.2, rng) for log in data]
+    some = ("coulomb_friction", "viscous_friction", "sensor_dropout", "sensor_delay", "action_lag")
+    report = diagnose(system(), None, data, effects=some)
+    found = {effect.name: effect for effect in report.effects}
+    assert set(found) == {"coulomb_friction", "sensor_dropout"}
+    assert found["coulomb_friction"].strength == pytest.approx(0.1, rel=0.1)
+    assert found["sensor_dropout"].strength == pytest.approx(0.2, rel=0.2)
