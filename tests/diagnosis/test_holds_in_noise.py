@@ -27,20 +27,22 @@ def shown(angle, lost, rng, noise=1e-3):
     return angle[last] + noise * rng.standard_normal(len(angle))
 
 
-@pytest.mark.parametrize("share", [0.03, 0.15, 0.4])
-def test_most_held_samples_of_a_moving_joint_are_found_and_put_right(share):
+@pytest.mark.parametrize(("share", "gain"), [(0.03, 1.0), (0.15, 0.8), (0.15, -1.0), (0.4, 1.0)])
+def test_most_held_samples_of_a_moving_joint_are_found_and_put_right(share, gain):
+    """Whatever gain its velocity has."""
     data = []
     for seed, rows in enumerate((300, 220, 300)):  # of several lengths
         angle, speed, rng = motion(seed, rows)
         lost = rng.random(rows) < share
         lost[0] = False
-        data.append((angle, speed, lost, shown(angle, lost, rng)))
+        data.append((angle, gain * speed, lost, shown(angle, lost, rng)))
     found = held_in_noise([one[3] for one in data], [one[1] for one in data], DT)
     assert abs(found.share - share) < 3 * np.sqrt(share / found.count)
+    assert found.gain == pytest.approx(1 / gain, rel=0.02)
     for (angle, speed, lost, seen), rows in zip(data, found.rows, strict=True):
-        moving = np.abs(speed) > 1.0
+        moving = np.abs(speed) > 1.0 * abs(gain)
         assert (rows != lost)[moving].mean() < 0.02
-        right = with_motion(seen, speed, rows, DT * np.arange(len(angle)))
+        right = with_motion(seen, found.gain * speed, rows, DT * np.arange(len(angle)))
         before, after = (np.abs(one - angle)[moving].mean() for one in (seen, right))
         assert after < min(0.7 * before, 2e-3)
         assert np.array_equal(right[~rows], seen[~rows])

@@ -68,10 +68,10 @@ def bridged(logs: Sequence[Log], robot: Robot) -> tuple[list[Log], list[Hold], l
         index = (robot.qpos_index if kind == "position" else robot.dof_index)[joint]
         dof = robot.dof_index[joint]
         columns = [getattr(log, name)[:, index].numpy() for log in result]
-        held, speeds = _to_the_digit(columns), None
+        held, led = _to_the_digit(columns), False
         if kind == "position" and not held.share:
             in_noise = _in_noise(result, index, dof)
-            held, speeds = (held, None) if in_noise is None else (in_noise, dof)
+            held, led = (held, False) if in_noise is None else (in_noise, True)
         moving = sum(_moving(column, h) for column, h in zip(columns, held.rows, strict=True))
         if moving < max(_ROWS, _LEAST * held.count) or held.share > _MOST:
             continue
@@ -83,11 +83,15 @@ def bridged(logs: Sequence[Log], robot: Robot) -> tuple[list[Log], list[Hold], l
         else:
             error = float(np.sqrt(held.share * (1 - held.share) / held.count))
             found.append(Hold(channel, held.share, error))
-            if speeds is not None:
+            if led:
                 rows = sum(int(h.sum()) for h in held.rows)
                 alarms.append(_NOTE.format(rows, sum(map(len, held.rows)), channel))
         result = [
-            _replaced(log, name, index, h, speeds=speeds) if h.any() else log
+            _replaced(
+                log, name, index, h, led=held.gain * log.qvel[:, dof].numpy() if led else None
+            )
+            if h.any()
+            else log
             for log, h in zip(result, held.rows, strict=True)
         ]
         if kind == "position":
@@ -142,15 +146,20 @@ def _in_noise(logs: Sequence[Log], index: int, dof: int) -> HeldSamples | None:
 
 
 def _replaced(
-    log: Log, name: str, index: int, held: NDArray[np.bool_], *, speeds: int | None
+    log: Log,
+    name: str,
+    index: int,
+    held: NDArray[np.bool_],
+    *,
+    led: NDArray[np.float64] | None,
 ) -> Log:
-    """Return a log with held samples on straight lines, or where measured velocities lead."""
+    """Return a log with held samples on straight lines, or where velocities lead."""
     values, time = getattr(log, name).clone(), log.time.numpy()
     column = values[:, index].numpy()
-    if speeds is None:
+    if led is None:
         column = np.interp(time, time[~held], column[~held])
     else:
-        column = with_motion(column, log.qvel[:, speeds].numpy(), held, time)
+        column = with_motion(column, led, held, time)
     values[:, index] = torch.from_numpy(column)
     return replace(log, **{name: values})
 

@@ -43,11 +43,13 @@ class HeldSamples:
         rows: For each log, shape ``(T,)``; where the joint stood still nobody can tell.
         share: Of the rows of which it is known.
         count: How many these are.
+        gain: How far positions go per measured velocity.
     """
 
     rows: list[Held]
     share: float
     count: int
+    gain: float = 1.0
 
 
 def held_in_noise(
@@ -87,7 +89,7 @@ def held_in_noise(
     rows = model.likeliest(scale, float(_SHARES[best[1]]))
     told = [held[1:][some[: len(held) - 1]] for held, some in zip(rows, moving, strict=True)]
     held = np.concatenate(told)
-    return HeldSamples(rows, float(held.mean()), len(held))
+    return HeldSamples(rows, float(held.mean()), len(held), model.gain)
 
 
 def with_motion(values: Array, speeds: Array, held: Held, time: Array) -> Array:
@@ -98,19 +100,45 @@ def with_motion(values: Array, speeds: Array, held: Held, time: Array) -> Array:
     return np.where(held, there, values)
 
 
+def _gain(moved: Array, changes: Array) -> float:
+    """Return how far positions go per velocity, whatever gains the sensors have.
+
+    The median of ratios weighted by motion: half of what is off is too small, and half too large.
+
+    >>> moved = np.array([[1.0, 2.0, 2.0, 1.0]])
+    >>> _gain(moved, np.array([[0.9, 1.8, 0.0, 2.7]]))
+    0.9
+    """
+    there = np.isfinite(changes) & (moved != 0)
+    if not there.any():
+        return 1.0
+    ratios, weights = changes[there] / moved[there], np.abs(moved[there])
+    order = np.argsort(ratios)
+    below = np.cumsum(weights[order])
+    return float(ratios[order][np.searchsorted(below, 0.5 * below[-1])])
+
+
 class _Model:
     """The hidden Markov model of several logs at once; rows beyond a log's end say nothing.
 
     Args:
-        gone: ``X``, shape ``(L, N)``.
+        moved: By how much the velocities say that it moved in each row, shape ``(L, N - 1)``.
         changes: ``y_k - y_{k-1}``, not a number beyond the end, shape ``(L, N - 1)``.
         lengths: Rows of each log.
+
+    Attributes:
+        gain: How far positions go per that.
+        gone: ``X``, shape ``(L, N)``.
+        there: Which rows there are.
+        scales: Those of ``s`` that are tried.
     """
 
-    def __init__(self, gone: Array, changes: Array, lengths: Sequence[int]) -> None:
-        self.gone, self.changes, self.lengths = gone, changes, list(lengths)
+    def __init__(self, moved: Array, changes: Array, lengths: Sequence[int]) -> None:
+        self.changes, self.lengths = changes, list(lengths)
         self.there = np.isfinite(changes)
-        off = np.abs(changes - np.diff(gone, axis=1))[self.there]
+        self.gain = _gain(moved, changes)
+        self.gone = self.gain * np.pad(np.cumsum(moved, 1), ((0, 0), (1, 0)))
+        off = np.abs(changes - self.gain * moved)[self.there]
         self.scales = _SCALES * (np.quantile(off, 0.25) / _QUARTILE)
         self.reach = float(np.nanmax(np.abs(changes)))
 
@@ -119,12 +147,11 @@ class _Model:
         """Return that of some logs; nothing of a joint that stands still."""
         rows = max(len(one) for one in values)
         pairs = list(zip(values, speeds, strict=True))
-        gone, changes = np.zeros((len(pairs), rows)), np.full((len(pairs), rows - 1), np.nan)
+        moved, changes = np.zeros((len(pairs), rows - 1)), np.full((len(pairs), rows - 1), np.nan)
         for i, (angle, speed) in enumerate(pairs):
-            gone[i, 1 : len(angle)] = np.cumsum(0.5 * dt * (speed[1:] + speed[:-1]))
-            gone[i, len(angle) :] = gone[i, len(angle) - 1]
+            moved[i, : len(angle) - 1] = 0.5 * dt * (speed[1:] + speed[:-1])
             changes[i, : len(angle) - 1] = np.diff(angle)
-        made = cls(gone, changes, [len(one) for one in values])
+        made = cls(moved, changes, [*map(len, values)])
         return made if made.scales[0] > 0 else None
 
     def moving(self, scale: float) -> Held:
