@@ -260,6 +260,13 @@ def test_friction_laws():
         against = np.sign(strength) * along
         np.testing.assert_array_equal(helps - against, [-strength] * 4)
         np.testing.assert_array_equal(helps + against, [0.0] * 4)
+    half, most = 2 * (1 - math.exp(-0.5)), 2 * (1 - math.exp(-3))
+    cases = (2.0, 0.3, most), (-2.0, 0.3, 0.0), (-2.0, -0.05, half), (2.0, 0.0, 0.0)
+    for strength, speed, expected in cases:  # one that begins over 0.1 rad/s
+        soft = forces("directional_friction", strength, qvel=speed, onset=0.1)["dof_damping"]
+        assert soft == at([expected / abs(speed) if speed else 0.0] * 4)
+    with pytest.raises(ValueError, match="onset, a speed over which friction begins"):
+        effect("directional_friction", onset=-0.1)
     # gear 2 at the shoulder, a servo of gain 5 that is 1 rad off, gear −1 at the rail
     loads = forces("load_dependent_friction", 0.5, ctrl=(1.5, 1.0, 4.0))["dof_frictionloss"]
     assert loads == at([1.5, 2.5, 2.0, 0.0])

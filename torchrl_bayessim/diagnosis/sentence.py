@@ -22,7 +22,7 @@ _BENT = {
     "softness": ", softness {:.2g}", "bend": ", bent by {:+.2g}",
     "settling": ", settling at {:.2g} per second",
     "second": ", {:.0%} of it in a second filter",
-    "presliding": ", after {:.2g} of presliding",
+    "presliding": ", after {:.2g} of presliding", "onset": ", beginning over a speed of {:.2g}",
     "aside": ", {:+.2g} of its distance beside the end",
 }  # fmt: skip
 

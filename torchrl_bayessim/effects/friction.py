@@ -24,12 +24,14 @@ import torch
 from torch import Tensor
 
 from ..scalars import check_number
-from .effect import ForceEffect, Memory, Now, Reach
+from .effect import Effect, ForceEffect, Memory, Now, Reach
 from .history import filled
 from .laws import within
 from .robot import Robot
 
 _PRESLIDING = 0.005  # rad or m
+_ONSET = 0.1  # rad/s or m/s
+_SLOWEST = 1e-6  # of that
 
 
 class PreslidingFriction(ForceEffect):
@@ -165,9 +167,30 @@ class DirectionalFriction(ForceEffect):
 
     Half of it is dry friction in both directions, half a force that helps in the other: so what
     sticks is held by as much as there is. N m or N, up to 30 % of ``F_max`` in either direction.
+
+    Or one that begins softly, as of a brush or a lip seal that is dragged along, and holds nothing
+    that stands: ``|s| (1 − e^{−|v| / v_0})``, as a damping.
+
+    Args:
+        onset: ``v_0``, rad/s or m/s; 0 for friction that is all there at once. A diagnosis fits it.
     """
 
     name, unit, group = "directional_friction", "N m", "friction"
+
+    def __init__(self, onset: float = 0.0) -> None:
+        check_number("onset, a speed over which friction begins", onset, least=0.0)
+        self.onset = onset
+
+    def forms(self, seconds: float) -> tuple[Effect, ...]:
+        """Return friction that is there at once, and one that begins softly."""
+        del seconds
+        return DirectionalFriction(), DirectionalFriction(onset=_ONSET)
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the speed of a soft beginning, up to a quarter of the largest."""
+        if not self.onset:
+            return {}
+        return {"onset": (0.05 * self.onset, 0.01, max(0.25 * reach.velocity, self.onset))}
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return ±0.3 ``F_max``."""
@@ -176,6 +199,10 @@ class DirectionalFriction(ForceEffect):
     def forces(
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
-        """Return the dry friction in this direction."""
-        del now
-        return {"frictionloss": strength.abs() / 2, "force": -strength / 2}, memory
+        """Return the friction in this direction."""
+        if not self.onset:
+            return {"frictionloss": strength.abs() / 2, "force": -strength / 2}, memory
+        along = now.velocity * strength.sign()
+        speed = along.clamp(min=_SLOWEST * self.onset) / self.onset
+        damping = strength.abs() / self.onset * -torch.expm1(-speed) / speed
+        return {"damping": torch.where(along > 0, damping, 0.0)}, memory
