@@ -12,7 +12,7 @@ from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.holds import bridged
 from torchrl_bayessim.diagnosis.holds_in_noise import held_in_noise, with_motion
 
-DT = 0.02
+DT, GENERATOR = 0.02, torch.Generator().manual_seed(0)
 
 
 def motion(seed=0, rows=300):
@@ -48,12 +48,16 @@ def test_most_held_samples_of_a_moving_joint_are_found_and_put_right(share, gain
         assert np.array_equal(right[~rows], seen[~rows])
 
 
-def test_nothing_is_held_by_a_sensor_that_is_late_or_has_play_or_a_robot_that_is_struck():
-    angle, speed, rng = motion(1)
+@pytest.mark.parametrize("rows", [300, 4000])
+def test_nothing_is_held_by_a_sensor_that_is_late_or_has_play_or_a_robot_that_is_struck(rows):
+    """However long the logs."""
+    angle, speed, rng = motion(1, rows)
     noise = 1e-3 * rng.standard_normal(len(angle))
     assert held_in_noise([angle + noise], [speed], DT) is None
     late = np.interp(np.arange(len(angle)) - 1.4, np.arange(len(angle)), angle)
     assert held_in_noise([late + noise], [speed], DT) is None
+    shaken = np.interp(np.arange(rows) - rng.random(rows), np.arange(rows), angle)
+    assert held_in_noise([shaken + noise], [speed], DT) is None
     play = angle.copy()
     for k in range(1, len(play)):  # follows within 0.05
         play[k] = np.clip(play[k - 1], angle[k] - 0.05, angle[k] + 0.05)
@@ -75,6 +79,33 @@ def test_only_positions_beside_measured_velocities_are_looked_at():
     assert same == guessed
     assert not holds
     assert not alarms
+
+
+def test_a_joint_that_rests_a_row_that_is_there_twice_and_a_short_log_hide_nothing():
+    rng = np.random.default_rng(4)
+    data = [shown_again(log, 0.2, rng) for log in logs(3)]
+    data = [twice_and_at_rest(log, 300, rng) for log in data]
+    short = replace(data[0], **{
+        name: getattr(data[0], name)[:9] for name in ("time", "qpos", "qvel", "ctrl")
+    })  # fmt: skip
+    found, (hold,), (note,) = bridged([*data, short], system().robot)
+    assert hold.share == pytest.approx(0.2, abs=3 * hold.error)
+    assert "are taken not to have been renewed" in note
+    assert len(found[-1]) == 9
+
+
+def twice_and_at_rest(log, rows, rng):
+    """Return a log of which the first row is there twice, and that goes on at rest."""
+    tail = torch.from_numpy(rng.normal(scale=0.0005, size=(rows, 1)))
+    qpos = torch.cat([log.qpos, log.qpos[-1:] + tail])
+    qpos[1] = qpos[0]
+    return replace(
+        log,
+        time=0.01 * torch.arange(len(log) + rows).double(),
+        qpos=qpos,
+        qvel=torch.cat([log.qvel, 0.02 * torch.randn(rows, 1, generator=GENERATOR).double()]),
+        ctrl=torch.cat([log.ctrl, torch.zeros(rows, 1).double()]),
+    )
 
 
 def test_friction_is_found_beside_them():

@@ -8,14 +8,23 @@ from noisy_cheetah import cheetah
 from scipy.stats import multivariate_normal
 from test_diagnose import logs, system
 
-from torchrl_bayessim.diagnosis.beside_jitter import beside_jitter
+from torchrl_bayessim.diagnosis.beside_jitter import (
+    _better,
+    _Seen,
+    _with_jitter,
+    beside_jitter,
+    outdone,
+)  # fmt: skip
 from torchrl_bayessim.diagnosis.chance import drawn
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.jitter import Responses, jitter, moments, shaken
+from torchrl_bayessim.diagnosis.loss_segments import loss_segments
+from torchrl_bayessim.diagnosis.model import judged_fits
 from torchrl_bayessim.diagnosis.moved_innovations import SCATTER, Judged, Moved, tell
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.preparation import prepare
 from torchrl_bayessim.effects.action import ActionJitter
+from torchrl_bayessim.effects.disturbance import ConstantForce
 
 SOME = (
     "action_delay", "action_lag", "action_jitter", "packet_drop", "coulomb_friction",
@@ -129,6 +138,70 @@ def test_the_strength_is_known_and_no_force_is_as_likely(prepared):
     assert found.cost < shaken(judged, unit) - 20
 
 
+def rough(rng, steps):
+    """Return commands that turn in every row."""
+    return np.clip(1.5 * rng.standard_normal(steps), -4, 4)
+
+
+def test_what_counts_as_noise_is_the_scatter_of_the_commands_that_were_sent(monkeypatch):
+    """Their mean is much smoother than they are."""
+    monkeypatch.setattr("test_diagnose.commands", rough)
+    data, robot = logs(act=late(3, 1.0)), system()
+    (unit,) = units_of([ActionJitter()], robot.robot)
+    prepared = prepare(robot, data, [], generator=np.random.default_rng(0))
+    sets = prepared.sets["train"], prepared.sets["validation"]
+    judged = [Responses.of(one, prepared.nominal.point, 40) for one in sets]
+    found = jitter(judged, [unit])
+    assert found.strength == pytest.approx(0.01, rel=0.35)  # and noise was thought to be more
+    (base,) = judged_fits(*sets, [prepared.nominal.point])
+    roots = {}
+    monkeypatch.setattr(
+        "torchrl_bayessim.diagnosis.beside_jitter.widened",
+        lambda prepared, given: roots.update(given) or prepared,
+    )
+    _with_jitter(prepared, _Seen(base, found, np.zeros(1)), np.random.default_rng(1))
+    for name, one in zip(("train", "validation"), judged, strict=True):
+        expected = one.moved(unit, found.strength).values.sum(-1).mean()
+        assert (roots[name] ** 2).sum((1, 2)).mean() > 0.8 * expected
+
+
+def test_what_the_search_no_longer_needs_beside_jitter_does_not_come_back(prepared):
+    prepared, unit = prepared
+    sets = prepared.sets["train"], prepared.sets["validation"]
+    judged = [Responses.of(one, prepared.nominal.point, 40) for one in sets]
+    (push,) = units_of([ConstantForce()], system().robot)
+    start = prepared.nominal.point
+    nothing, pushed = judged_fits(*sets, [start, Point(start.z, {push: 1e-4})])
+    seen = _Seen(pushed, jitter(judged, [unit]), np.zeros(1))
+    more = SimpleNamespace(best=nothing, reduced=lambda base: SimpleNamespace(best=base))
+    found, kept = _better(prepared, prepared, seen, more=more, units=[unit])
+    assert found.base is kept.best is nothing
+    seen, more.best = _Seen(nothing, seen.jitter, np.zeros(1)), pushed  # and need not come in
+    found, kept = _better(prepared, prepared, seen, more=more, units=[unit])
+    assert found is seen
+    assert not kept.best.units
+
+
+def test_losses_are_outdone_only_by_jitter_that_is_plainly_likelier(prepared):
+    prepared, unit = prepared
+    segments = loss_segments(prepared)
+    suspects = SimpleNamespace(nominal=segments, best={})
+    judged = [
+        Responses.of(segments[name].objective, segments[name].point, len(segments[name].left))
+        for name in ("train", "validation")
+    ]
+    cost = jitter(judged, [unit]).cost
+
+    def lost(deviance, gain):
+        return SimpleNamespace(deviance=deviance, gain=gain, beside=False)
+
+    assert outdone(suspects, [lost(cost + 41, 100.0)], [unit])
+    assert not outdone(suspects, [lost(cost + 39, 100.0)], [unit])
+    assert not outdone(suspects, [lost(cost + 150, 1000.0)], [unit])
+    assert not outdone(suspects, [lost(cost + 41, 100.0), lost(cost, 100.0)], [unit])
+    assert not outdone(suspects, [lost(cost + 41, 100.0)], [])
+
+
 def test_jitter_is_named_beside_friction_in_the_place_of_a_lag():
     data = logs(12, act=late(1, 1.5), push=lambda q, v: -0.3 * np.tanh(v / 0.01))
     report = diagnose(system(), None, data, effects=SOME)
@@ -137,10 +210,11 @@ def test_jitter_is_named_beside_friction_in_the_place_of_a_lag():
     assert found["coulomb_friction"].strength == pytest.approx(0.3, rel=0.1)
     low, high = found["action_jitter"].ci95
     assert low < 0.015 < high
-    assert found["action_jitter"].share_of_gap > 0.01
+    assert 0.3 < found["action_jitter"].share_of_gap < 0.95
     assert sum(one.share_of_gap for one in found.values()) <= 1.0
     assert report.gap.with_effects < 1.4
     assert any("as late as jitter makes them" in alarm for alarm in report.alarms)
+    assert {c.name for c in report.candidates} == set(SOME)
     assert {c.status for c in report.candidates if c.name == "action_jitter"} == {"named"}
 
 

@@ -22,29 +22,30 @@ from ..effects.action import ActionJitter
 from ..logs.log import Log
 from .chance import Chance, calm
 from .jitter import Jitter, Responses, jitter, moments, shaken
-from .loss_suspects import Suspects
+from .loss_suspects import JUDGED, Suspects
 from .model import Model, judged_fits
 from .modes import Mode
-from .moved_innovations import deviances_without
+from .moved_innovations import deviances_without, everywhere
 from .objective import Objective, Point, Unit
-from .preparation import Prepared, Started
+from .preparation import Prepared
+from .prepared_anew import with_other_logs
 from .scatter import Sent
 from .selection import Selection
 from .varying import widened
 
 Array = NDArray[np.float64]
-_JUDGED = "train", "validation"
 _SEGMENTS, _FEW = 40, 8  # of each split, and to see whether it is worth a closer look
 _NEEDED, _CERTAIN = 10.0, 40.0  # deviance, on a few segments and on all
 _LIKELY = 6.0  # deviance that chance often makes
 _PLAINLY = 0.2  # of what losses gain: by how much jitter has to be likelier
-_ROUGH = 0.2  # of what jitter gains beside what is late: by how much it may be worse in its place
-_SURE = 1.5  # standard errors of segments by which the mean gain exceeds zero
+# of what jitter gains beside what is late: by how much it may be worse in its place, and at most
+_ROUGH, _MUCH = 0.2, 150.0
 _CALM = 1.3  # φ beyond which jitter has not explained the scatter
 _AGAIN = 4  # steps of a fit without what is late
 _NOTE = (
-    "commands at {} are taken to arrive as late as jitter makes them on average, and its scatter "
-    "as noise; causes beside it were looked for so"
+    "commands at {} are taken to act as late as jitter makes them on average, and its scatter "
+    "counts as noise where other causes are looked for; the gap without causes is of the commands "
+    "as they were sent"
 )
 
 
@@ -80,10 +81,9 @@ class _Seen:
     without: Array
 
     @property
-    def everywhere(self) -> bool:
-        """Whether it explains more than a few segments: what chance does, it does everywhere."""
-        gains = self.without - self.jitter.told.costs
-        return bool(gains.mean() > _SURE * gains.std(ddof=1) / np.sqrt(len(gains)))
+    def price(self) -> float:
+        """Its deviance and what chance often gains with so many effects."""
+        return self.jitter.cost + _LIKELY * len(self.base.units)
 
 
 def beside_jitter(
@@ -111,17 +111,26 @@ def beside_jitter(
         return None
     again = _with_jitter(prepared, seen, generator)
     _, more = search(again, known=_without_late(selection, seen.base), varied=True)
-    found = seen
-    if more.best.units != seen.base.units:
-        judged = _judged(prepared, more.best.fit.point, _SEGMENTS)
-        found = _Seen(more.best, jitter(judged, units), seen.without)
-        if found.jitter.cost > seen.jitter.cost - _LIKELY:
-            sets = again.sets["train"], again.sets["validation"]
-            base = judged_fits(*sets, [seen.base.fit.point], iterations=_AGAIN)[0]
-            found, more = seen, more.reduced(base)
-    if found.jitter.told.scatter > _CALM or not found.everywhere:
+    found, more = _better(prepared, again, seen, more=more.seen_as(selection), units=units)
+    gains = found.without - found.jitter.told.costs
+    if found.jitter.told.scatter > _CALM or not everywhere(gains):
         return None
     return _told(prepared, again, found, before=selection, more=more)
+
+
+def _better(
+    prepared: Prepared, again: Prepared, seen: _Seen, *, more: Selection, units: Sequence[Unit]
+) -> tuple[_Seen, Selection]:
+    """Return jitter beside what was found again, if that is worth it, or beside what there was."""
+    if set(more.best.units) == set(seen.base.units):
+        return seen, more
+    judged = _judged(prepared, more.best.fit.point, _SEGMENTS)
+    found = _Seen(more.best, jitter(judged, units), seen.without)
+    if found.price < seen.price:
+        return found, more
+    sets = again.sets["train"], again.sets["validation"]
+    base = judged_fits(*sets, [seen.base.fit.point], iterations=_AGAIN)[0]
+    return seen, more.reduced(base)
 
 
 def outdone(suspects: Suspects, found: Sequence[Chance], units: Sequence[Unit]) -> bool:
@@ -136,7 +145,7 @@ def outdone(suspects: Suspects, found: Sequence[Chance], units: Sequence[Unit]) 
     if not units:
         return False
     segments = suspects.best if found[0].beside else suspects.nominal
-    each = [segments[name] for name in _JUDGED]
+    each = [segments[name] for name in JUDGED]
     judged = [Responses.of(one.objective, one.point, len(one.left)) for one in each]
     likeliest, losses = jitter(judged, units), min(found, key=lambda one: one.deviance)
     # losses in bursts are not what losses are taken for either
@@ -149,9 +158,7 @@ def _seen(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> _S
     best = selection.best
     for base in _bases(prepared, selection):
         few = _judged(prepared, base.fit.point, _FEW)
-        without = _without(few, best)
-        likeliest = min(units, key=lambda unit: jitter(few, [unit]).cost)
-        if jitter(few, [likeliest]).cost > without.sum() - _NEEDED:
+        if jitter(few, units).cost > _without(few, best).sum() - _NEEDED:
             continue
         judged = _judged(prepared, base.fit.point, _SEGMENTS)
         found = _Seen(base, jitter(judged, units), _without(judged, best))
@@ -161,7 +168,7 @@ def _seen(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> _S
         if base is not best:
             late = _judged(prepared, best.fit.point, _SEGMENTS)
             beside = jitter(late, [found.jitter.unit]).cost
-            slack = max(_LIKELY, _ROUGH * (found.without.sum() - beside))
+            slack = min(max(_LIKELY, _ROUGH * (found.without.sum() - beside)), _MUCH)
             if found.jitter.cost > beside + slack:
                 continue
         return found
@@ -169,16 +176,22 @@ def _seen(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> _S
 
 
 def _bases(prepared: Prepared, selection: Selection) -> list[Model]:
-    """Return what was found without what is late, and parameters alone: all may make up for it."""
-    best = selection.best
-    kept = {u: s for u, s in best.fit.point.strengths.items() if not _late(u)}
-    if len(kept) == len(best.units):
-        return [best] if not kept else [best, selection.nominal]
-    if not kept:
-        return [selection.nominal]
-    point = Point(best.fit.point.z, kept)
-    sets = prepared.sets["train"], prepared.sets["validation"]
-    return [*judged_fits(*sets, [point], iterations=_AGAIN), selection.nominal]
+    """Return what was found without what is late, and parameters alone: all may make up for it.
+
+    Or without what is late of commands, where sensors are.
+    """
+    best, sets = selection.best, (prepared.sets["train"], prepared.sets["validation"])
+    strengths = best.fit.point.strengths
+    found: dict[frozenset[Unit], Model] = {}
+    for late in (_late, lambda unit: _late(unit) and unit.effect.channel != "sensing"):
+        kept = {unit: strength for unit, strength in strengths.items() if not late(unit)}
+        if not kept or frozenset(kept) in found:
+            continue
+        point = Point(best.fit.point.z, kept)
+        same = len(kept) == len(best.units)
+        model = best if same else judged_fits(*sets, [point], iterations=_AGAIN)[0]
+        found[frozenset(kept)] = model
+    return [*found.values(), selection.nominal]
 
 
 def _late(unit: Unit) -> bool:
@@ -186,7 +199,7 @@ def _late(unit: Unit) -> bool:
 
 
 def _judged(prepared: Prepared, point: Point, most: int) -> list[Responses]:
-    return [Responses.of(prepared.sets[name], point, most) for name in _JUDGED]
+    return [Responses.of(prepared.sets[name], point, most) for name in JUDGED]
 
 
 def _without(judged: Sequence[Responses], best: Model) -> Array:
@@ -195,8 +208,12 @@ def _without(judged: Sequence[Responses], best: Model) -> Array:
 
 def _without_late(selection: Selection, base: Model) -> Selection:
     """Return where a search goes on from, without what is late: of one kind with jitter."""
-    offered = tuple(unit for unit in selection.offered if not _late(unit))
-    tried = tuple(m for m in selection.tried if not any(_late(unit) for unit in m.units))
+
+    def other(unit: Unit) -> bool:
+        return not _late(unit) or unit in base.units
+
+    offered = tuple(unit for unit in selection.offered if other(unit))
+    tried = tuple(model for model in selection.tried if all(map(other, model.units)))
     return replace(selection, best=base, tried=tried, offered=offered)
 
 
@@ -208,20 +225,14 @@ def _with_jitter(prepared: Prepared, seen: _Seen, generator: np.random.Generator
         name: [_on_average(log, unit, strength / dt) for log in part]
         for name, part in prepared.logs.items()
     }
-    predictor = prepared.predictor.divided(prepared.predictor.substeps)  # searches change theirs
-    predictor.steps = prepared.predictor.steps
-    history = prepared.sets["train"].segments.history
-    started = Started(
-        predictor, prepared.mode, history, prepared.horizon, prepared.noise,
-        prepared.noise_source, prepared.alarms,
-    )  # fmt: skip
-    again = started.fitted(logs, generator)
+    again = with_other_logs(prepared, logs, generator=generator)
     roots = {}
-    for name in _JUDGED:
-        train = again.sets[name]
-        moved = Responses.of(train, seen.base.fit.point, len(train.segments)).moved(unit, strength)
+    for name in JUDGED:
+        sent = again.sets[name].along(prepared.sets[name].segments)  # what is late is what was sent
+        moved = Responses.of(sent, seen.base.fit.point, len(sent.segments)).moved(unit, strength)
         roots[name] = moved.vectors * np.sqrt(moved.values)[:, None]
-    return widened(again.alarmed(_NOTE.format(unit.where)), roots)
+    where = "all actuators" if unit.where == "all" else unit.where
+    return widened(again.alarmed(_NOTE.format(where)), roots)
 
 
 def _on_average(log: Log, unit: Unit, steps: float) -> Log:

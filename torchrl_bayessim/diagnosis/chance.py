@@ -21,7 +21,6 @@ __all__ = [
     "detectable",
     "drawn",
     "of_chance",
-    "scattered",
     "unseen",
 ]
 
@@ -33,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..effects.effect import SensorEffect
-from .moved_innovations import Judged, Moved, Told, deviances_without, tell
+from .moved_innovations import Judged, Moved, Told, deviances_without, everywhere, tell
 from .objective import Objective, Point, Unit, strengths_of
 from .screening import crossing
 from .selection import Selection
@@ -49,7 +48,6 @@ _WHITE = 1.15  # mean squared innovation of a model that leaves nothing to chanc
 _CALM = 1.3  # φ beyond which an effect of chance has not explained the scatter
 _SEGMENTS = 8  # of each split
 _APART = 4  # targets of one effect that are looked at singly
-_SURE = 1.5  # standard errors of segments by which the mean gain exceeds zero
 _LEAST = 0.3  # relative error of a strength: so few draws do not span what chance may do
 _NEEDED, _LIKELY = 20.0, 6.0  # deviances: to be found, and that chance often makes
 
@@ -210,11 +208,6 @@ def drawn(objective: Objective, points: Sequence[Point], count: int) -> Array:
     return np.stack(found, 1)
 
 
-def scattered(draws: Array) -> Array:
-    """Return a root of the covariance of draws ``(R, S, M)`` in each segment, ``(S, R, M)``."""
-    return np.asarray((draws - draws.mean(0)).transpose(1, 0, 2) / np.sqrt(len(draws) - 1))
-
-
 def _refined(
     judged: Sequence[Judged],
     test: Objective,
@@ -235,8 +228,7 @@ def _refined(
     costs = np.array([one.cost for one in told])
     best = int(np.argmin(costs))
     gains = base - told[best].costs
-    everywhere = gains.mean() > _SURE * gains.std(ddof=1) / np.sqrt(len(gains))
-    if told[best].scatter > _CALM or not everywhere:
+    if told[best].loudest > _CALM or not everywhere(gains):
         return None
     unseen = Judged.of(test, point, _SEGMENTS)
     moved = Moved.by(_draws(unseen, [points[best]], _MANY)[0])

@@ -71,7 +71,7 @@ class Found:
             prepared.sets["test"],
             list(points.values()),
             generator,
-            floor=_floor(selection, prepared.sets),
+            floor=1.0 if prepared.varied else _floor(selection, prepared.sets),
             beside=prepared.sets["validation"],
         )
         equals = {name: confusion_set(selection, name) for name in credit}

@@ -41,7 +41,8 @@ class Hold:
 
     Attributes:
         channel: Its name.
-        share: Of the rows that repeat the one before.
+        share: Of the rows that repeat the one before; of those in which the joint moved, where
+            velocities tell.
         error: Standard deviation of the share.
     """
 
@@ -51,9 +52,10 @@ class Hold:
 
 
 def bridged(logs: Sequence[Log], robot: Robot) -> tuple[list[Log], list[Hold], list[str]]:
-    """Return the logs with held samples replaced by straight lines, and the channels concerned.
+    """Return the logs with held samples replaced, and the channels concerned.
 
-    And an alarm for each that only is slower than the log: it is renewed in equal intervals.
+    By straight lines, or where measured velocities lead, if those say that they are held. And an
+    alarm for each that only is slower than the log: it is renewed in equal intervals.
 
     Args:
         logs: As recorded.
@@ -69,16 +71,16 @@ def bridged(logs: Sequence[Log], robot: Robot) -> tuple[list[Log], list[Hold], l
         dof = robot.dof_index[joint]
         columns = [getattr(log, name)[:, index].numpy() for log in result]
         held, led = _to_the_digit(columns), False
-        if kind == "position" and not held.share:
+        if kind == "position" and not _enough(columns, held):
             in_noise = _in_noise(result, index, dof)
             held, led = (held, False) if in_noise is None else (in_noise, True)
-        moving = sum(_moving(column, h) for column, h in zip(columns, held.rows, strict=True))
-        if moving < max(_ROWS, _LEAST * held.count) or held.share > _MOST:
+        if not _enough(columns, held) or held.share > _MOST:
             continue
-        if _regular(held.rows, held.share):
+        if _regular(held.rows):
+            way = "where its velocities lead" if led else "straight"
             alarms.append(
                 f"{channel} is renewed every {1 / (1 - held.share):.2g} rows: between them it was "
-                "taken to go straight"
+                f"taken to go {way}"
             )
         else:
             error = float(np.sqrt(held.share * (1 - held.share) / held.count))
@@ -99,13 +101,20 @@ def bridged(logs: Sequence[Log], robot: Robot) -> tuple[list[Log], list[Hold], l
     return result, found, alarms
 
 
-def _regular(held: Sequence[NDArray[np.bool_]], share: float) -> bool:
+def _enough(columns: Sequence[NDArray[np.float64]], held: HeldSamples) -> bool:
+    """Return whether so many samples are held while a joint moves that it is no accident."""
+    moving = sum(_moving(column, h) for column, h in zip(columns, held.rows, strict=True))
+    return moving >= max(_ROWS, _LEAST * held.count)
+
+
+def _regular(held: Sequence[NDArray[np.bool_]]) -> bool:
     """Return whether samples are renewed in intervals more equal than chance makes them.
 
     >>> every_other = np.arange(400) % 2 == 1
-    >>> _regular([every_other], 0.5), _regular([np.random.default_rng(0).random(400) < 0.5], 0.5)
+    >>> _regular([every_other]), _regular([np.random.default_rng(0).random(400) < 0.5])
     (True, False)
     """
+    share = float(np.concatenate(held).mean())
     intervals = np.concatenate([np.diff(np.flatnonzero(~h)) for h in held])
     by_chance = share / (1 - share) ** 2  # of a geometric distribution
     return len(intervals) > 1 and float(intervals.var()) < _EQUAL * by_chance
@@ -139,7 +148,7 @@ def _in_noise(logs: Sequence[Log], index: int, dof: int) -> HeldSamples | None:
     """Return which samples are held where noise was added to them, by measured velocities."""
     measured = all(bool(log.measured[log.qvel.shape[1] + dof]) for log in logs)
     angles = [log.qpos[:, index].numpy() for log in logs]
-    if not measured or any(len(one) < _ROWS or lattice_step(one) > 0 for one in angles):
+    if not measured or any(lattice_step(one) > 0 for one in angles):
         return None
     dt = float(np.median(np.concatenate([np.diff(log.time.numpy()) for log in logs])))
     return held_in_noise(angles, [log.qvel[:, dof].numpy() for log in logs], dt)

@@ -31,7 +31,7 @@ _QUARTILE = 0.319  # of a normal distribution's size
 _LONGEST = 12  # rows
 _OUTLIERS = 0.03  # share, of any size
 _UNCAUGHT = 1e-6  # of those that make up for held ones: a joint with play does not
-_SURE = 300.0  # deviance
+_SURE, _EACH = 300.0, 7.0  # deviance, and for each sample that is held
 _MOVING, _MOVED = 4.0, 0.1  # s that a joint moves in a row, and the share of rows in which it does
 
 
@@ -83,10 +83,12 @@ def held_in_noise(
     costs = model.deviances()
     best = np.unravel_index(costs.argmin(), costs.shape)
     scale = float(model.scales[best[0]])
-    moving = model.moving(scale)
-    if costs[:, 0].min() - costs[best] < _SURE or moving[model.there].mean() < _MOVED:
+    moving, gained = model.moving(scale), float(costs[:, 0].min() - costs[best])
+    if gained < _SURE or moving[model.there].mean() < _MOVED:
         return None
     rows = model.likeliest(scale, float(_SHARES[best[1]]))
+    if gained < _EACH * sum(int(held.sum()) for held in rows):
+        return None
     told = [held[1:][some[: len(held) - 1]] for held, some in zip(rows, moving, strict=True)]
     held = np.concatenate(told)
     return HeldSamples(rows, float(held.mean()), len(held), model.gain)

@@ -33,7 +33,9 @@ Array = NDArray[np.float64]
 _TIMES = 64  # τ at which the integrals are taken
 _LEVELS = np.geomspace(0.02, 1.0, 9)  # of the range of the strength
 _FINER = np.geomspace(0.65, 1.55, 7)  # times the best of these
-_SIZES = np.geomspace(0.01, 1.0, 7)  # of the largest command: a force that varies by itself
+_SIZES = np.geomspace(
+    0.01, 1.0, 7
+)  # of the largest command there was: a force that varies by itself
 _LEAST, _MOST = 0.05, 0.5  # relative error of a strength: what else differs counts too
 
 
@@ -84,8 +86,8 @@ class Responses:
 
     def pushed(self, unit: Unit, size: float) -> Moved:
         """Return what a force does there that is another in each step, whatever was commanded."""
-        scale = self.judged.objective.predictor.system.robot.command_scale
-        roots = [size * float(scale[t]) * self.slopes(t) for t in unit.targets]
+        ctrl = np.abs(self.judged.objective.segments.ctrl)
+        roots = [size * ctrl[..., t].max() * self.slopes(t) for t in unit.targets]
         return Moved.of(np.zeros_like(self.judged.left), np.concatenate(roots, -1))
 
 

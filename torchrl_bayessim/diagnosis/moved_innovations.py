@@ -9,7 +9,16 @@ likelihood, Wood 2010)::
 
 from __future__ import annotations
 
-__all__ = ["SCATTER", "Judged", "Moved", "Told", "deviances_without", "tell"]
+__all__ = [
+    "SCATTER",
+    "Judged",
+    "Moved",
+    "Told",
+    "deviances_without",
+    "everywhere",
+    "scattered",
+    "tell",
+]
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +31,7 @@ from .refit import refit
 
 Array = NDArray[np.float64]
 SCATTER = np.geomspace(0.6, 4.0, 20)  # φ
+_SURE = 1.5  # standard errors of segments by which the mean gain exceeds zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +76,7 @@ class Moved:
     @classmethod
     def by(cls, draws: Array) -> Moved:
         """Return it by some draws of what chance does, ``(R, S, M)``."""
-        mean = draws.mean(0)
-        return cls.of(mean, (draws - mean).transpose(1, 2, 0) / np.sqrt(len(draws) - 1))
+        return cls.of(draws.mean(0), scattered(draws).transpose(0, 2, 1))
 
     def change(self, judged: Judged) -> Array:
         """Return ``δ``, how the fit changes beside it."""
@@ -100,13 +109,26 @@ class Moved:
         return np.asarray(columns - np.einsum("smr,srd->smd", self.vectors, shrunk))
 
 
+def scattered(draws: Array) -> Array:
+    """Return a root of the covariance of draws ``(R, S, M)`` in each segment, ``(S, R, M)``."""
+    return np.asarray((draws - draws.mean(0)).transpose(1, 0, 2) / np.sqrt(len(draws) - 1))
+
+
 @dataclass(frozen=True, eq=False)
 class Told:
-    """What the judged segments say of chance: ``δ``, the likeliest ``φ``, deviances with it."""
+    """What the judged segments say of chance.
+
+    Attributes:
+        change: ``δ``.
+        costs: Their deviances.
+        scatter: The likeliest ``φ`` of all.
+        loudest: The largest of those of each split.
+    """
 
     change: Array
     costs: Array
     scatter: float
+    loudest: float
 
     @property
     def cost(self) -> float:
@@ -120,7 +142,8 @@ def tell(judged: Sequence[Judged], moved: Sequence[Moved]) -> Told:
     found = [one.deviances(data, change)[0] for data, one in zip(judged, moved, strict=True)]
     costs = np.concatenate(found, 1)
     best = int(costs.sum(1).argmin())
-    return Told(change, costs[best], float(SCATTER[best]))
+    loudest = max(float(SCATTER[cost.sum(1).argmin()]) for cost in found)
+    return Told(change, costs[best], float(SCATTER[best]), loudest)
 
 
 def deviances_without(judged: Sequence[Judged], point: Point) -> Array:
@@ -129,3 +152,8 @@ def deviances_without(judged: Sequence[Judged], point: Point) -> Array:
     size = np.concatenate([np.full(len(data.left), data.left.shape[1]) for data in judged])
     costs = squares / SCATTER[:, None] + size * np.log(SCATTER)[:, None]
     return np.asarray(costs[costs.sum(1).argmin()])
+
+
+def everywhere(gains: Array) -> bool:
+    """Return whether more than a few segments gain: what chance does, it does everywhere."""
+    return bool(gains.mean() > _SURE * gains.std(ddof=1) / np.sqrt(len(gains)))

@@ -53,6 +53,7 @@ class Prepared:
         alarms: What the reader must know.
         mode: What is predicted and compared.
         beside: The simulator with effects beside which chance was looked for; none if it was not.
+        varied: Whether what varies counts as noise in training and validation segments.
     """
 
     predictor: Predictor
@@ -65,6 +66,7 @@ class Prepared:
     alarms: tuple[str, ...]
     mode: Mode
     beside: Point | None = None
+    varied: bool = False
 
     @property
     def names(self) -> dict[str, tuple[str, ...]]:

@@ -55,14 +55,14 @@ def _along(test: Objective, pieces: Segments, points: Sequence[Point]) -> NDArra
 class Sent:
     """Mean squared innovations of test segments with the commands that were sent.
 
-    Where others are taken to have arrived, on which everything else is compared; or of samples as
+    Where others are taken to have acted, on which everything else is compared; or of samples as
     they were recorded, where those that were lost are interpolated.
 
     Attributes:
         raw: At the prior's mean.
         refit: With parameters that were fitted to these.
         effects: With the effects that last, and parameters that were fitted beside them.
-        lost: How many commands, or samples, of all runs are taken to have been lost.
+        lost: How many commands, or samples, of all runs are taken to have been others.
         of: How many there are.
         samples: Whether they are samples.
     """
@@ -199,7 +199,11 @@ class Scatter:
         alone = self.found[0].alone
         if alone is None:
             return before
-        return replace(self.measured(before, generator), refit=min(alone, before.refit))
+        refit = min(alone, before.refit)
+        part = max(refit - 1.0, 0.0) / max(before.refit - 1.0, 1e-9)
+        low, high = before.excess_ci
+        measured = self.measured(before, generator)
+        return replace(measured, refit=refit, excess_ci=(part * low, part * high))
 
     def with_holds(self, before: Shrinkage) -> Shrinkage:
         """Return how far the gap of the samples as they were recorded shrinks."""
@@ -222,7 +226,10 @@ class Scatter:
             refit=refit,
             explained=share,
             explained_ci=(low, high),
-            excess_ci=(max(before.excess_ci[0], 0.5 * (refit - 1.0)), refit - 1.0),
+            excess_ci=(
+                min(max(before.excess_ci[0], 0.5 * (refit - 1.0)), refit - 1.0),
+                refit - 1.0,
+            ),
         )
 
     def held_findings(self, measured: Shrinkage, others: float) -> tuple[Finding, ...]:

@@ -51,6 +51,15 @@ class Selection:
     alternatives: dict[str, tuple[Model, ...]]
     offered: tuple[Unit, ...] = ()
 
+    def seen_as(self, before: Selection) -> Selection:
+        """Return it with what was seen of every effect before, where noise alone was noise."""
+        return replace(
+            self,
+            screens=(before.screens[0], *self.screens[1:]),
+            p_values=(before.p_values[0], *self.p_values[1:]),
+            offered=before.offered,
+        )
+
     def reduced(self, best: Model, tried: Sequence[Model] = ()) -> Selection:
         """Return the selection with a best model of fewer effects, and its own alternatives.
 

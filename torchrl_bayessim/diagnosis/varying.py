@@ -29,9 +29,10 @@ from numpy.typing import NDArray
 from ..effects.action import ActionDelay
 from ..effects.sensors import SensorDelay
 from .cells import plain
-from .chance import drawn, scattered
+from .chance import drawn
 from .model import WHITE, Model
 from .modes import Mode
+from .moved_innovations import scattered
 from .objective import Objective, Point, Unit, strengths_of
 from .preparation import Prepared
 from .refit import refit
@@ -108,7 +109,7 @@ def widened(prepared: Prepared, roots: Mapping[str, Array]) -> Prepared:
     for name, root in roots.items():
         sets[name] = _widened(sets[name], root)
     nominal = refit(sets["train"], [prepared.nominal.point], iterations=_AGAIN)[0]
-    return replace(prepared, sets=sets, nominal=nominal)
+    return replace(prepared, sets=sets, nominal=nominal, varied=True)
 
 
 def _wavering(sets: Mapping[str, Objective], point: Point, unit: Unit) -> list[Varying]:

@@ -58,21 +58,23 @@ def with_chance(
     """
     random, suspects = of_chance(units), Suspects.of(prepared, selection, units)
     found = losses(prepared, selection, suspects) if suspects else []
-    sent, recorded = None, 1.0
+    sent, shaken, recorded = None, None, 1.0
+    seen = replace(prepared, alarms=alarms)
     if holds:
         recorded = gap_with_holds(prepared, logs, selection)
     elif suspects:
-        seen = replace(prepared, alarms=alarms)
         sought = Sought(seen, selection, found, suspects, search, generator)
         if beside := beside_lost_commands(sought) or beside_lost_samples(sought):
             prepared, selection, found, sent = beside.told()
     if not holds and sent is None and _may_be_jitter(suspects, found, units):
-        shaken = beside_jitter(prepared, selection, units, search=search, generator=generator)
-        if shaken is not None:
-            prepared, selection, sent = shaken.prepared, shaken.selection, shaken.sent
-            found = [shaken.chance]
+        shaken = beside_jitter(seen, selection, units, search=search, generator=generator)
+    if shaken is not None:
+        found, sent = [shaken.chance], shaken.sent
+        if sent is not None:
+            prepared, selection = shaken.prepared, shaken.selection
     found = found or chances(prepared.sets, selection, random)
-    if sent is None and not holds and not any(chance.beside for chance in found):
+    elsewhere = sent is None and shaken is None and not holds
+    if elsewhere and not any(chance.beside for chance in found):
         prepared, more = _beside_variation(search, prepared, selection, random)
         if more is not selection:
             found, selection = [], more
@@ -108,14 +110,7 @@ def _beside_variation(
     refused = any(more.best.names <= model.names for model in selection.tried)
     if refused and explains(selection.best, _under_noise_alone(prepared, more.best)):
         return prepared, selection
-    # what was seen of every effect where noise alone was noise
-    more = replace(
-        more,
-        screens=(selection.screens[0], *more.screens[1:]),
-        p_values=(selection.p_values[0], *more.p_values[1:]),
-        offered=selection.offered,
-    )
-    return wider, more
+    return wider, more.seen_as(selection)
 
 
 def _under_noise_alone(prepared: Prepared, model: Model) -> Model:
