@@ -94,6 +94,14 @@ def test_a_joint_that_rests_a_row_that_is_there_twice_and_a_short_log_hide_nothi
     assert len(found[-1]) == 9
 
 
+@pytest.mark.parametrize("rows", [1, 2, 5, 9])
+def test_logs_of_a_few_rows_say_nothing(rows):
+    names = "time", "qpos", "qvel", "ctrl"
+    data = [replace(log, **{name: getattr(log, name)[:rows] for name in names}) for log in logs(2)]
+    assert bridged(data, system().robot) == (data, [], [])
+    assert bridged([], system().robot) == ([], [], [])
+
+
 def twice_and_at_rest(log, rows, rng):
     """Return a log of which the first row is there twice, and that goes on at rest."""
     tail = torch.from_numpy(rng.normal(scale=0.0005, size=(rows, 1)))

@@ -148,7 +148,8 @@ def _in_noise(logs: Sequence[Log], index: int, dof: int) -> HeldSamples | None:
     """Return which samples are held where noise was added to them, by measured velocities."""
     measured = all(bool(log.measured[log.qvel.shape[1] + dof]) for log in logs)
     angles = [log.qpos[:, index].numpy() for log in logs]
-    if not measured or any(lattice_step(one) > 0 for one in angles):
+    on_lattice = any(lattice_step(one) > 0 for one in angles if len(one) > 2)
+    if not measured or on_lattice or max(map(len, angles), default=0) < _ROWS:
         return None
     dt = float(np.median(np.concatenate([np.diff(log.time.numpy()) for log in logs])))
     return held_in_noise(angles, [log.qvel[:, dof].numpy() for log in logs], dt)
