@@ -11,7 +11,7 @@ from __future__ import annotations
 
 __all__ = ["Shaken", "beside_jitter", "outdone"]
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from ..effects.action import ActionJitter
 from ..logs.log import Log
-from .chance import Chance, calm
+from .beside_losses import CERTAIN
+from .chance import CALM, Chance, calm
 from .jitter import Jitter, Responses, jitter, moments, shaken
 from .loss_suspects import JUDGED, Suspects
-from .model import Model, judged_fits
+from .model import LIKELY, Model, judged_fits
 from .modes import Mode
 from .moved_innovations import deviances_without, everywhere
 from .objective import Objective, Point, Unit
@@ -35,12 +36,10 @@ from .varying import widened
 
 Array = NDArray[np.float64]
 _SEGMENTS, _FEW = 40, 8  # of each split, and to see whether it is worth a closer look
-_NEEDED, _CERTAIN = 10.0, 40.0  # deviance, on a few segments and on all
-_LIKELY = 6.0  # deviance that chance often makes
+_NEEDED = 10.0  # deviance on a few segments
 _PLAINLY = 0.2  # of what losses gain: by how much jitter has to be likelier
 # of what jitter gains beside what is late: by how much it may be worse in its place, and at most
 _ROUGH, _MUCH = 0.2, 150.0
-_CALM = 1.3  # φ beyond which jitter has not explained the scatter
 _AGAIN = 4  # steps of a fit without what is late
 _NOTE = (
     "commands at {} are taken to act as late as jitter makes them on average, and its scatter "
@@ -83,7 +82,7 @@ class _Seen:
     @property
     def price(self) -> float:
         """Its deviance and what chance often gains with so many effects."""
-        return self.jitter.cost + _LIKELY * len(self.base.units)
+        return self.jitter.cost + LIKELY * len(self.base.units)
 
 
 def beside_jitter(
@@ -113,7 +112,7 @@ def beside_jitter(
     _, more = search(again, known=_without_late(selection, seen.base), varied=True)
     found, more = _better(prepared, again, seen, more=more.seen_as(selection), units=units)
     gains = found.without - found.jitter.told.costs
-    if found.jitter.told.scatter > _CALM or not everywhere(gains):
+    if found.jitter.told.scatter > CALM or not everywhere(gains):
         return None
     return _told(prepared, again, found, before=selection, more=more)
 
@@ -149,7 +148,7 @@ def outdone(suspects: Suspects, found: Sequence[Chance], units: Sequence[Unit]) 
     judged = [Responses.of(one.objective, one.point, len(one.left)) for one in each]
     likeliest, losses = jitter(judged, units), min(found, key=lambda one: one.deviance)
     # losses in bursts are not what losses are taken for either
-    margin = max(_CERTAIN, _PLAINLY * losses.gain)
+    margin = max(CERTAIN, _PLAINLY * losses.gain)
     return likeliest.cost < losses.deviance - margin
 
 
@@ -163,35 +162,36 @@ def _seen(prepared: Prepared, selection: Selection, units: Sequence[Unit]) -> _S
         judged = _judged(prepared, base.fit.point, _SEGMENTS)
         found = _Seen(base, jitter(judged, units), _without(judged, best))
         gained = found.without.sum() - found.jitter.cost
-        if gained < _CERTAIN or found.jitter.cost > shaken(judged, found.jitter.unit):
+        if gained < CERTAIN or found.jitter.cost > shaken(judged, found.jitter.unit):
             continue
         if base is not best:
             late = _judged(prepared, best.fit.point, _SEGMENTS)
             beside = jitter(late, [found.jitter.unit]).cost
-            slack = min(max(_LIKELY, _ROUGH * (found.without.sum() - beside)), _MUCH)
+            slack = min(max(LIKELY, _ROUGH * (found.without.sum() - beside)), _MUCH)
             if found.jitter.cost > beside + slack:
                 continue
         return found
     return None
 
 
-def _bases(prepared: Prepared, selection: Selection) -> list[Model]:
-    """Return what was found without what is late, and parameters alone: all may make up for it.
+def _bases(prepared: Prepared, selection: Selection) -> Iterator[Model]:
+    """Yield what was found without what is late, and parameters alone: all may make up for it.
 
     Or without what is late of commands, where sensors are.
     """
     best, sets = selection.best, (prepared.sets["train"], prepared.sets["validation"])
     strengths = best.fit.point.strengths
-    found: dict[frozenset[Unit], Model] = {}
+    given: list[dict[Unit, float]] = [{}]
     for late in (_late, lambda unit: _late(unit) and unit.effect.channel != "sensing"):
         kept = {unit: strength for unit, strength in strengths.items() if not late(unit)}
-        if not kept or frozenset(kept) in found:
+        if kept in given:
             continue
-        point = Point(best.fit.point.z, kept)
-        same = len(kept) == len(best.units)
-        model = best if same else judged_fits(*sets, [point], iterations=_AGAIN)[0]
-        found[frozenset(kept)] = model
-    return [*found.values(), selection.nominal]
+        given.append(kept)
+        if kept == strengths:
+            yield best
+        else:
+            yield judged_fits(*sets, [Point(best.fit.point.z, kept)], iterations=_AGAIN)[0]
+    yield selection.nominal
 
 
 def _late(unit: Unit) -> bool:

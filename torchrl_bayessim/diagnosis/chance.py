@@ -15,6 +15,7 @@ leaves errors too, so an effect of chance must leave noise alone by its own stan
 from __future__ import annotations
 
 __all__ = [
+    "CALM",
     "Chance",
     "calm",
     "chances",
@@ -32,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..effects.effect import SensorEffect
+from .model import LIKELY
 from .moved_innovations import Judged, Moved, Told, deviances_without, everywhere, tell
 from .objective import Objective, Point, Unit, strengths_of
 from .screening import crossing
@@ -45,11 +47,11 @@ _FINER = np.geomspace(_LEVELS[0], _LEVELS[-1], 10)
 _LATE = "timing"  # the group of effects that are late
 _AROUND = (0.65, 0.8, 1.25, 1.55)  # times the best of these
 _WHITE = 1.15  # mean squared innovation of a model that leaves nothing to chance
-_CALM = 1.3  # φ beyond which an effect of chance has not explained the scatter
+CALM = 1.3  # φ beyond which an effect of chance has not explained the scatter
 _SEGMENTS = 8  # of each split
 _APART = 4  # targets of one effect that are looked at singly
 _LEAST = 0.3  # relative error of a strength: so few draws do not span what chance may do
-_NEEDED, _LIKELY = 20.0, 6.0  # deviances: to be found, and that chance often makes
+_NEEDED = 20.0  # deviance, to be found
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +137,11 @@ def chances(
     found = [
         _refined(judged, sets["test"], unit, strength, point=point, base=base)
         for unit, (cost, strength) in best.items()
-        if cost < least + 4 * _LIKELY
+        if cost < least + 4 * LIKELY
     ]
     found = [chance for chance in found if chance is not None]
     most = max((chance.gain for chance in found), default=0.0)
-    found = [c for c in found if c.gain > max(_NEEDED, most - _LIKELY)]
+    found = [c for c in found if c.gain > max(_NEEDED, most - LIKELY)]
     return sorted(found, key=lambda c: -c.gain)
 
 
@@ -160,7 +162,7 @@ def unseen(sets: Mapping[str, Objective], selection: Selection, units: Sequence[
         return []
     point = selection.nominal.fit.point
     judged = [Judged.of(sets[name], point, _SEGMENTS) for name in ("train", "validation")]
-    most = float(deviances_without(judged, selection.best.fit.point).sum()) + _LIKELY
+    most = float(deviances_without(judged, selection.best.fit.point).sum()) + LIKELY
     best = _likeliest(judged, point, [(u, level * u.high) for u in alike for level in _FINER])
     return list(dict.fromkeys(unit.name for unit, (cost, _) in best.items() if cost < most))
 
@@ -228,7 +230,7 @@ def _refined(
     costs = np.array([one.cost for one in told])
     best = int(np.argmin(costs))
     gains = base - told[best].costs
-    if told[best].loudest > _CALM or not everywhere(gains):
+    if told[best].loudest > CALM or not everywhere(gains):
         return None
     unseen = Judged.of(test, point, _SEGMENTS)
     moved = Moved.by(_draws(unseen, [points[best]], _MANY)[0])

@@ -78,7 +78,8 @@ def held_in_noise(
         True
     """
     model = _Model.of(values, speeds, dt)
-    if model is None:
+    # most joints move less from row to row, and need no more
+    if model is None or model.moving(float(model.scales[0]))[model.there].mean() < _MOVED:
         return None
     costs = model.deviances()
     best = np.unravel_index(costs.argmin(), costs.shape)
