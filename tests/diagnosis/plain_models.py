@@ -38,9 +38,9 @@ class Unit(NamedTuple):
 A, B, C = Unit("gain", "knee"), Unit("gain", "hip"), Unit("friction", "hip")
 
 
-def plain(units, deviance, *, z=0.0, segments=40, flipped=False):
+def plain(units, deviance, *, z=0.0, segments=40, width=10, flipped=False):
     """Return a model of units, or of strengths; the other side is left if ``flipped``."""
-    left = np.full((segments // 2, 10), np.sqrt(deviance / (10 * segments))) * (-1) ** flipped
+    left = np.full((segments // 2, width), np.sqrt(deviance / (width * segments))) * (-1) ** flipped
     strengths = dict(units) if isinstance(units, dict) else dict.fromkeys(units, 1.0)
     point = Point(np.array([z]), strengths)
     jacobian = np.ones((left.size, 1 + len(units)))

@@ -89,6 +89,7 @@ def test_a_share_that_may_be_nothing_is_named_with_reserve(low, verdict):
         unsaid=False,
         elsewhere=False,
         helps=False,
+        together=False,
         several=False,
     )
     assert weighed.named(ambiguous=False) == verdict

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from plain_models import A, C, plain
 
 from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
 from torchrl_bayessim.diagnosis.verdict import _Weighed
@@ -18,14 +19,10 @@ def verdict(
     share = float(np.clip(explained, -1.0, 1.0))
     excess = (-0.2, 0.3) if refit < 1.05 else (0.5 * (refit - 1.0), 2 * refit)
     measured = Shrinkage(raw, refit, left, share, ci, excess, (left - 1.1, left - 0.9), by_chance)
+    units = (A, C)[:laws]
     models = [
-        SimpleNamespace(
-            units=units,
-            names=units * laws,
-            validation=np.full((20, 100), mean**0.5),
-            fit=SimpleNamespace(innovations=np.full((20, 100), mean**0.5)),
-        )
-        for units, mean in zip(((), ("unit",)), validation, strict=True)
+        plain(there, 4000 * mean, segments=40, width=100)
+        for there, mean in zip(((), units), validation, strict=True)
     ]
     found = SimpleNamespace(
         p_values=[1.0 if chance else sure],
@@ -130,3 +127,26 @@ def test_two_laws_that_are_told_as_one_cause_may_leave_less_than_one():
 def test_a_certain_cause_that_surely_helps_is_named_with_what_remains(changes, said):
     known = {"refit": 2.0, "left": 1.67, "sure": 1e-20, "ci": (0.25, 0.6), "by_chance": 1e-4}
     assert verdict(validation=(2.0, 1.6), **(known | changes)) == said
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "named_partial"),
+        ({"left": 1.13}, "named_partial"),  # what does nothing there is a little off by chance
+        ({"left": 1.2}, "none"),  # test runs speak against it
+        ({"sure": 1e-3}, "none"),
+        ({"guessed": True}, "none"),
+        ({"validation": (1.1, 1.098)}, "none"),  # a gain that chance often makes
+        ({"validation": (1.3, 1.2)}, "none"),  # something is wrong that an effect may make up for
+    ],
+)
+def test_what_all_other_runs_show_of_a_gap_no_larger_than_noise_is_named(changes, said):
+    known = {
+        "refit": 1.12,
+        "left": 1.08,
+        "sure": 1e-5,
+        "ci": (-9.0, 1.0),
+        "validation": (1.1, 1.08),
+    }
+    assert verdict(**(known | changes)) == said

@@ -18,7 +18,6 @@ from ..effects.action import PacketDrop
 from ..effects.sensors import SensorDropout
 from .loss_law import LossLaw, Told, likeliest
 from .loss_segments import LossSegments, loss_segments
-from .model import Model
 from .modes import Mode
 from .objective import Unit
 from .preparation import Prepared
@@ -30,6 +29,7 @@ SPOILED = (0.003, 0.01, 0.03, 0.1, 0.3)  # η
 LIKELIER = 0.5  # probability that a segment has a loss, or is spoiled
 NOISE = 1.2  # scatter that noise has
 FEWEST = 4  # segments with a loss
+_MISSING = 1e-4  # p-value of what effects that last leave, to be more than chance
 LEFT = 2.0  # mean squared innovation of what has not explained the losses
 
 
@@ -88,7 +88,7 @@ class Suspects:
         nominal = loss_segments(prepared)
         best = {n: one.at(selection.best.fit.point) for n, one in nominal.items()}
         found = cls(some, nominal, best)
-        return None if _explained(found.rival, selection.best) else found
+        return None if _explained(found.rival, selection) else found
 
     @cached_property
     def alone(self) -> Alone:
@@ -101,12 +101,15 @@ class Suspects:
         return Alone.of(self.best)
 
 
-def _explained(rival: Alone, best: Model) -> bool:
+def _explained(rival: Alone, found: Selection) -> bool:
     """Return whether effects that last leave noise alone.
 
-    In short segments, where lost commands are hardly more than a lag, and in those of the search.
+    In short segments, where lost commands are hardly more than a lag, and in those of the search,
+    where a few that are lost may show all the same.
     """
-    return bool(best.units) and rival.calm and best.dispersion() < LEFT
+    best = found.best
+    calm = rival.calm and best.dispersion() < LEFT
+    return bool(best.units) and calm and found.p_values[-1] > _MISSING
 
 
 def spoiled_share(told: Told) -> float:

@@ -16,6 +16,7 @@ __all__ = [
     "numbers",
     "price",
     "shown",
+    "shown_together",
     "total_gain",
 ]
 
@@ -36,6 +37,7 @@ _CHANCE = 0.01  # of a test that two models explain the data equally well
 _NEXT_TO_NOTHING, _OF_ITS_OWN = 0.03, 0.05  # of what all runs of the fit gain; of one's deviance
 _WORSE = 1.5  # times the misfit of the best model: too much for an equal, however few the data
 _CERTAIN, _SEVERAL = 5.0, 2  # times what judging runs must gain; runs of the fit that gain it
+_TOGETHER = 6.0  # the same of all runs together, where noise alone seems left
 WHITE = 1.2  # mean squared innovation of a model that leaves noise alone
 
 
@@ -143,12 +145,15 @@ def shown(base: Model, model: Model) -> bool:
     """Return whether segments that no fit saw show that a model is better than its base.
 
     Or those of several runs of the fit, beyond doubt, if the others do not disagree, or by next to
-    nothing: what shows in some motions only need not be in the runs that judge.
+    nothing: what shows in some motions only need not be in the runs that judge. Or all together
+    where the base leaves little more than noise: there is nothing that an effect could make up for.
     """
     if gain(base, model) > needed(base, model):
         return True
-    if not base.units or gain(base, model) < 0:
+    if gain(base, model) < 0:
         return False
+    if not base.units:
+        return shown_together(base, model)
     count = len(model.fit.innovations)
     logs = model.logs[:count]
     better = (base.deviances() - model.deviances())[:count] / model.dispersion()
@@ -156,6 +161,19 @@ def shown(base: Model, model: Model) -> bool:
     runs = int((each > _CERTAIN * needed(base, model)).sum())
     nothing = np.minimum(_NEXT_TO_NOTHING * each.sum(), _OF_ITS_OWN * had / model.dispersion())
     return runs >= _SEVERAL and not (each < -np.maximum(nothing, LIKELY)).any()
+
+
+def shown_together(base: Model, model: Model) -> bool:
+    """Return whether all runs together show what is better than little more than noise.
+
+    A single run has to show it twice as surely: it may be odd.
+    """
+    gains = (base.deviances() - model.deviances()) / model.dispersion()
+    each, least = np.bincount(model.logs, gains), needed(base, model)
+    together, alone = float(each.sum()), float(each.max())
+    several = together - alone > least
+    sure = together > _TOGETHER * least * (1.0 if several else 2.0)
+    return base.mean_square < WHITE and sure
 
 
 def as_good(best: Model, rival: Model) -> bool:

@@ -37,6 +37,7 @@ def sentence(
     candidates: Sequence[Candidate],
     confused: Sequence[str],
     validated: float | None,
+    unshown: bool,
     where: Mapping[str, Any],
     odd: Collection[str],
     hint: str,
@@ -52,6 +53,7 @@ def sentence(
         candidates: What the data say about every effect.
         confused: Names that cannot be told from the cause, itself first.
         validated: Share that is explained on validation runs, where they speak for test runs.
+        unshown: Whether the effects are sure from other runs, and test runs cannot confirm them.
         where: The error's place.
         odd: Runs that depart from the simulator as no other does.
         hint: What keeps these data from saying anything.
@@ -76,6 +78,8 @@ def sentence(
         share = f"{verb} {_percent(validated)} of it on validation runs, test runs hardly show it"
     elif measured.refit <= NEGLIGIBLE:
         share = "found on other runs, too small to matter on test runs"
+    elif unshown:
+        share = "found on other runs, test runs show too little to say how much it explains"
     others = _rivals_of_others(effects, confused)
     if verdict == "ambiguous":
         equals = ", ".join(map(plain, confused))
@@ -84,7 +88,8 @@ def sentence(
             f"{share}.{others}{parameters}{untested}"
         )
     text = f"{gap} {'Cause' if len(effects) == 1 else 'Causes'}: {causes}, {share}"
-    partial = verdict != "named" and validated is None and measured.refit > NEGLIGIBLE
+    told = validated is None and not unshown and measured.refit > NEGLIGIBLE
+    partial = verdict != "named" and told
     text += f"; {_percent(1 - measured.explained)} remain." if partial else "."
     if len(confused) > 1:
         text += f" Not separable from: {', '.join(map(plain, confused[1:]))}."

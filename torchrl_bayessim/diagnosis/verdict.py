@@ -9,7 +9,8 @@ how much of it the effects explain, not only whether it is significant::
                    fifth of it
     named_partial  effects explain at least 40 %; the rest is located. Or 80 % on validation runs,
                    where test runs hardly show the gap. Or perhaps 40 %, of a cause that is certain
-                   and surely helps on test runs, and leaves less than the noise once more
+                   and surely helps on test runs, and leaves less than the noise once more. Or of a
+                   gap no larger than noise what all other runs together show beyond doubt
     ambiguous      effects of different kinds explain the data equally well
     unknown        the gap is real, and the catalogue explains less than 40 % of it, or perhaps none
     not_testable   the data are too few or too uniform to say
@@ -27,6 +28,7 @@ import numpy as np
 
 from ..logs.system import System
 from .divergence import HINT
+from .model import shown_together
 from .preparation import Prepared
 from .report import Candidate, Finding, Verdict
 from .selection import Selection
@@ -46,10 +48,11 @@ from .validation import (
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
 _PLAIN = 4.0  # the same, to need no interval: few segments have a wide one, as about impacts
 _CERTAIN = 1e-15  # p-value of a gap that is too small to be seen at a glance
+_DOUBTLESS = 1e-4  # the same, where an effect removes it from all runs
 _MOST = 0.5  # of the joints without measured velocity
 _NOISE_AGAIN = 2.0  # mean squared innovation: as much again as the noise
 _ALL = 0.98
-_WORSE = 1.1  # times what parameters alone leave on test runs
+_NO_WORSE, _WORSE = 1.02, 1.1  # times what parameters alone leave on test runs
 
 
 def conclude(
@@ -112,6 +115,7 @@ def conclude(
         verdict = "unknown"
     names = verdict.startswith("named") or verdict == "ambiguous"
     alarms = [obstacle[0]] if obstacle else [*doubts] if names else []
+    partly = verdict == "named_partial" and weighed.unsaid
     validated = weighed.validated if weighed.elsewhere and verdict == "named_partial" else None
     text = sentence(
         verdict,
@@ -122,6 +126,7 @@ def conclude(
         candidates=candidates,
         confused=confused,
         validated=validated,
+        unshown=partly and weighed.together and not weighed.helps,
         where=where,
         odd=odd,
         hint=obstacle[1] if obstacle else "",
@@ -142,6 +147,7 @@ class _Weighed:
         unsaid: Whether test runs do not say that what was found explains it.
         elsewhere: Whether validation runs do in their place.
         helps: Whether it surely helps on test runs, however much of the gap it explains.
+        together: Whether all other runs together show it, of a gap that is no larger than noise.
         several: Whether several effects were found.
     """
 
@@ -153,6 +159,7 @@ class _Weighed:
     unsaid: bool
     elsewhere: bool
     helps: bool
+    together: bool
     several: bool
 
     @classmethod
@@ -179,6 +186,9 @@ class _Weighed:
         # runs that hold little of what chance does say nothing against it, if it is sure
         surely = min((e.p_value for e in effects), default=1.0) < _CERTAIN
         by_chance = bool(scattered) and (surely or measured.refit > SHOWN)
+        together = p_value < _DOUBTLESS and shown_together(selection.nominal, selection.best)
+        together |= bool(scattered) and surely and measured.refit < SHOWN
+        together &= measured.effects < _NO_WORSE * measured.refit and not guessed
         perhaps_nothing = measured.explained_ci[0] <= 0 and validated < PARTIAL and not by_chance
         unsaid = measured.explained < PARTIAL or perhaps_nothing
         contradicted = measured.effects > SHOWN * measured.refit  # by what test runs do show
@@ -193,8 +203,9 @@ class _Weighed:
         # told as one cause or not: together, laws imitate many a third one nearly
         several = len(effects) > 1 or len(selection.best.names) > 1
         return cls(
-            measured, significant, certain, visible, validated, unsaid, elsewhere, helps, several
-        )
+            measured, significant, certain, visible, validated, unsaid, elsewhere, helps, together,
+            several,
+        )  # fmt: skip
 
     def named(self, *, ambiguous: bool) -> Verdict:
         """Return the verdict on effects that were found."""
@@ -205,7 +216,7 @@ class _Weighed:
             return "named_partial" if self.significant and not worse else "none"
         if self.unsaid:
             sure = self.visible or self.certain
-            borne_out = self.elsewhere or self.helps
+            borne_out = self.elsewhere or self.helps or self.together
             return "named_partial" if borne_out else "unknown" if sure else "none"
         if ambiguous:
             return "ambiguous"
