@@ -20,6 +20,9 @@ class Unit(NamedTuple):
     group: str = ""  # default its name
     channel: str = "body"
 
+    def inside(self, strength):
+        return min(strength, self.high)
+
     @property
     def targets(self):
         return [i for i, part in enumerate(self.direction) if part]

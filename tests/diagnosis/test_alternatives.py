@@ -48,6 +48,35 @@ def test_a_law_that_bends_is_tried_in_the_place_of_an_effect_with_as_many_number
     assert found == [aside] * count
 
 
+@pytest.mark.parametrize(
+    ("places", "kept", "numbers"),
+    [(2, {DRAG: 1.0}, 4), (2, {DRAG: 1.0}, 5), (1, {DRAG: 1.0}, 3), (2, {}, 3)],
+    ids=["one number more", "two more", "at one place", "alone"],
+)
+def test_one_law_that_bends_is_tried_in_the_place_of_several_beside_another(
+    monkeypatch, places, kept, numbers
+):
+    """Neither the payload as it is offered nor one of another kind comes near."""
+    shift = [Unit("com_shift", where, group="inertia") for where in ("x", "y")[:places]]
+    laws = [Unit("payload", "hip", group="inertia"), Unit("spring", "hip", group="elasticity")]
+    best, aside = plain([*shift, *kept], 300.0), plain([laws[0], *kept], 290.0)
+    tried = []
+
+    def fits(*given):
+        tried.extend(given[-1])
+        return [plain(dict(start.strengths), 9000.0) for start in given[-1]]
+
+    monkeypatch.setattr(alternatives, "judged_fits", fits)
+    monkeypatch.setattr(
+        alternatives, "fitted_numbers", lambda model, _: numbers if model is aside else 3
+    )
+    monkeypatch.setattr(alternatives, "bendable", lambda *_: True)
+    monkeypatch.setattr(alternatives, "with_fitted_forms", lambda *_: aside)
+    found = alternatives._of_one_law(("train", "validation"), best, kept, [*laws, *shift])
+    assert found == [aside] * (places > 1 and bool(kept) and numbers < 5)
+    assert all(laws[0] in start.strengths and DRAG in start.strengths for start in tried)
+
+
 def test_what_explains_nearly_as_much_is_bent_to_the_data(monkeypatch):
     """Only the best with each effect, and none that explains much less or has nothing to bend."""
     bent = {}

@@ -1,10 +1,13 @@
 """The simulator that follows from a report: its effects, and their strengths as parameters."""
 
+import numpy as np
 import pytest
 import torch
 from torchrl.envs import TransformedEnv, check_env_specs
 
+from torchrl_bayessim.diagnosis.commands import commanded
 from torchrl_bayessim.diagnosis.report import Report
+from torchrl_bayessim.diagnosis.segments import Segments
 from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.effects.robot import robot_of
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
@@ -88,6 +91,27 @@ def test_fitted_strengths_act_with_and_without_parameters(physics):
     late = torch.cat([commands[:, :1], commands[:, :-1]], 1)  # one control step
     clean = BatchedMujocoEnv(NAME, 3, threads=1)
     torch.testing.assert_close(path(make(report(DELAY), physics), commands), path(clean, late))
+
+
+@pytest.mark.parametrize("names", [("action_bias", "saturation"), ("saturation", "action_bias")])
+@pytest.mark.parametrize("physics", [None, MujocoPhysics("body_mass[pole]")])
+def test_a_bias_reaches_a_limit_whichever_was_found_first(names, physics):
+    """The same in the replay that a diagnosis looks at and in the simulator that it gives."""
+    strengths = {"action_bias": 1.5, "saturation": 0.4}
+    found = {effect(name): {"slide": strengths[name]} for name in names}
+    sent = torch.randn(3, 8, 1, generator=torch.Generator().manual_seed(0)).clamp(-1, 1) * 3
+    reached = (sent + 1.5).clamp(-1.8, 1.8)
+    clean = BatchedMujocoEnv(NAME, 3, threads=1)
+    torch.testing.assert_close(path(make(report(found), physics), sent), path(clean, reached))
+    known = {one: np.array([[strengths[one.name]]]) for one in found}
+    ctrl = sent.double().numpy()
+    time, at = ROBOT.dt * np.tile(np.arange(8.0), (3, 1)), np.arange(3)
+    states = np.zeros((3, 8, 2))
+    segments = Segments(
+        8, 0, 1 + np.arange(8), at, at, time, states, states, ctrl, *np.zeros((2, 2))
+    )
+    sequences, which = commanded(ROBOT, segments, known, 1)
+    np.testing.assert_allclose(sequences[which], reached.numpy(), atol=1e-6)
 
 
 def test_several_effects_are_each_a_transform():

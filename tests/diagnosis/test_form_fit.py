@@ -10,12 +10,20 @@ from test_diagnose import ARM, FINER, logs
 from test_diagnose import system as robot
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
-from torchrl_bayessim.diagnosis.form_fit import _nearest_offered, _Shift, with_forms_anew
+from torchrl_bayessim.diagnosis.form_fit import (
+    _corner,
+    _nearest_offered,
+    _Shift,
+    _value,
+    softened,
+    with_fitted_forms,
+    with_forms_anew,
+)
 from torchrl_bayessim.diagnosis.model import judged
 from torchrl_bayessim.diagnosis.objective import Point, Unit, units_of
 from torchrl_bayessim.diagnosis.preparation import prepare
 from torchrl_bayessim.diagnosis.refit import refit
-from torchrl_bayessim.effects.action import Saturation
+from torchrl_bayessim.effects.action import ActionBias, Saturation
 from torchrl_bayessim.effects.sensors import SensorDrift
 from torchrl_bayessim.effects.transmission import ServoGain
 from torchrl_bayessim.envs.task import Task
@@ -25,6 +33,7 @@ SOME = (
     "cogging", "coulomb_friction", "parallel_spring", "periodic_disturbance", "sensor_drift",
     "viscous_friction",
 )  # fmt: skip
+ARMS = robot().robot
 FREQUENCY, PHASE, RATE = 1.37, 0.6, 31.0
 
 
@@ -172,6 +181,43 @@ def test_what_is_straightened_is_a_law_that_was_offered_and_can_be_fitted(softne
     assert _nearest_offered(shift, offered) == expected
     assert shift.paid(offered)
     assert not _Shift(unit_of(Saturation(0.5)), "softness", 0.02, 0.1, 1.0).paid(offered)
+
+
+def limited(u, k):
+    """A motor that is told a little more than it should be, and cuts what is too much."""
+    return float(np.clip(u[k] + 0.5, -1.5, 1.5))
+
+
+def test_a_hard_limit_is_found_from_afar_by_way_of_a_soft_one():
+    """From a limit of nearly all commands, where half as hard a one does not cut any less."""
+    units = [u for e in (Saturation(), Saturation(0.5), ActionBias()) for u in units_of([e], ARMS)]
+    hard, soft, bias = units
+    known = prepare(robot(), logs(act=limited), units, generator=np.random.default_rng(0))
+    sets = known.sets["train"], known.sets["validation"]
+    z = known.nominal.point.z
+    (bent,) = judged(*sets, refit(sets[0], [Point(z, {soft: 0.05, bias: 0.1})]))
+    assert bent.mean_square > 2.0
+    sharp = with_fitted_forms(*sets, bent, units)
+    strengths = dict(sharp.fit.point.strengths)
+    assert strengths.keys() == {hard, bias}
+    assert strengths[hard] == pytest.approx(1 - 1.5 / 4, abs=0.01)
+    assert strengths[bias] == pytest.approx(0.5, abs=0.02)
+    assert sharp.mean_square < 1.2
+    (stuck,) = judged(*sets, refit(sets[0], [Point(z, {hard: 0.2, bias: 0.1})], iterations=2))
+    (led,) = softened(*sets, [stuck], units)
+    assert dict(led.fit.point.strengths).keys() == {hard, bias}
+    assert led.fit.cost == pytest.approx(sharp.fit.cost, rel=0.01)
+    assert not softened(*sets, [bent], units)  # it is soft already
+
+
+def test_a_law_with_a_corner_takes_the_place_of_the_sharpest_soft_one_only():
+    for softness, expected in ((0.1, True), (0.2, False)):
+        shift = _Shift(unit_of(Saturation(softness)), "softness", 0.02, 0.1, 1.0)
+        assert (_value(shift) <= shift.least) is expected
+    hard, elsewhere = unit_of(Saturation()), replace(unit_of(Saturation()), where="other")
+    shift = _Shift(unit_of(Saturation(0.1)), "softness", 0.02, 0.1, 1.0)
+    assert _corner(shift, [unit_of(Saturation(0.5)), elsewhere, hard]) == hard
+    assert _corner(shift, [unit_of(Saturation(0.5)), elsewhere]) is None
 
 
 def unit_of(effect):

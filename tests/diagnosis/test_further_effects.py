@@ -153,13 +153,13 @@ def test_what_is_at_the_same_joint_may_be_the_form_of_its_law():
 def test_a_gain_that_other_runs_do_not_show_is_no_effect_elsewhere():
     base, better = plain([FRICTION], 590.0), plain([FRICTION, SENSOR], 575.0)
     seen, _ = screened({SENSOR: 400.0})
-    assert not further_effects._elsewhere(base, better, seen, "robot", far=1.5)
+    assert not further_effects._elsewhere(base, better, seen, "robot", beyond=0.0)
 
 
 @pytest.mark.parametrize(
     ("mine", "other", "apart"),
-    [(60.0, 15.0, True), (30.0, 0.0, False), (60.0, 30.0, False)],
-    ids=["plain", "faint", "a rival is near"],
+    [(60.0, 15.0, True), (30.0, 0.0, False), (60.0, 30.0, False), (120.0, 65.0, True)],
+    ids=["plain", "faint", "a rival is near", "far enough from a rival"],
 )
 @pytest.mark.parametrize("gap", [2e5, 2e6], ids=["a little of the gap", "as a force a little off"])
 def test_what_shows_elsewhere_is_an_effect_although_noise_alone_seems_left(gap, mine, other, apart):

@@ -57,19 +57,21 @@ def explained(report):
 
 
 @pytest.mark.parametrize(
-    ("units", "calm", "left", "explained"),
+    ("changes", "explained"),
     [
-        (("delay",), True, 1.0, True),
-        (("delay",), True, 4.0, False),  # over longer segments
-        (("delay",), False, 1.0, False),
-        ((), True, 1.0, False),
+        ({}, True),
+        ({"left": 4.0}, False),  # over longer segments
+        ({"calm": False}, False),
+        ({"units": ()}, False),
+        ({"missing": 1e-8}, False),  # hardly more than noise, but surely more
     ],
 )
-def test_a_lag_explains_lost_commands_only_if_it_does_over_long_segments(
-    units, calm, left, explained
-):
-    best = Model(fit=SimpleNamespace(units=units), validation=np.full((9, 4), left**0.5), logs=None)
-    assert _explained(SimpleNamespace(calm=calm), best) is explained
+def test_a_lag_explains_lost_commands_only_if_it_does_over_long_segments(changes, explained):
+    given = {"units": ("delay",), "calm": True, "left": 1.0, "missing": 0.3} | changes
+    left = np.full((9, 4), given["left"] ** 0.5)
+    best = Model(fit=SimpleNamespace(units=given["units"]), validation=left, logs=None)
+    found = SimpleNamespace(best=best, p_values=(1e-30, given["missing"]))
+    assert _explained(SimpleNamespace(calm=given["calm"]), found) is explained
 
 
 @pytest.mark.slow

@@ -18,7 +18,14 @@ from ..effects.effect import Effect
 from ..effects.joints import CoulombFriction
 from ..effects.transmission import ServoDeadBand
 from .explanations import compare
-from .form_fit import bendable, fitted_numbers, priced, with_fitted_forms, with_forms_anew
+from .form_fit import (
+    bendable,
+    fitted_numbers,
+    priced,
+    softened,
+    with_fitted_forms,
+    with_forms_anew,
+)
 from .model import (
     LIKELY,
     Model,
@@ -89,6 +96,7 @@ def alternatives(
         known += _raced((train, validation), _with_each(base, additions.values()), best)
         known += _as_before((train, validation), best, name, tried)
         known += _bent((train, validation), best, known, offered)
+        known += _of_one_law((train, validation), best, kept, offered)
         known += _sliding((train, validation), best, kept, units)
         known += _sticking((train, validation), best, name, units)
         if train.width > Objective.width:
@@ -139,6 +147,31 @@ def _bent(
     return [m for m in fitted if m not in plain and fitted_numbers(m, offered) <= most]
 
 
+def _of_one_law(
+    sets: tuple[Objective, Objective],
+    best: Model,
+    kept: Mapping[Unit, float],
+    offered: Collection[Unit],
+) -> list[Model]:
+    """Return bent laws of its kind, beside others, in the place of an effect at several places.
+
+    Centres of mass that are shifted along several axes may be one payload, held aside, beside which
+    a spring hardens: neither law alone comes near before both are bent.
+    """
+    mine = [unit for unit in best.units if unit not in kept]
+    if not kept or len(mine) < 2:
+        return []
+    names, kinds = {u.name for u in mine}, {kind(u.effect) for u in mine}
+    alike = [u for u in offered if u.name not in names and kind(u.effect) in kinds]
+    laws = [u for u in alike if u.where != "all" and bendable(sets[0], [u])]
+    z = best.fit.point.z
+    starts = [Point(z, {**kept, u: u.inside(_LITTLE * u.high)}) for u in laws]
+    plain = sorted(judged_fits(*sets, starts), key=lambda m: m.mean_square)[:_LAWS]
+    fitted = [with_fitted_forms(*sets, model, offered) for model in plain]
+    most = fitted_numbers(best, offered) + 1
+    return [m for m in fitted if fitted_numbers(m, offered) <= most]
+
+
 def _in_their_forms(
     sets: tuple[Objective, Objective],
     best: Model,
@@ -154,14 +187,14 @@ def _in_their_forms(
     """
     explained = float((start.deviances() - best.deviances()).sum())
     near = [
-        m
-        for m in known
-        if bendable(sets[0], m.units)
-        and float((m.deviances() - best.deviances()).sum()) < _NEARLY * explained
+        m for m in known if float((m.deviances() - best.deviances()).sum()) < _NEARLY * explained
     ]
-    plain = list(best_by_effect(near, best).values())[:_FORMS]
+    able = [m for m in near if bendable(sets[0], m.units)]
+    plain = list(best_by_effect(able, best).values())[:_FORMS]
     fitted = [with_forms_anew(*sets, model, offered) for model in plain]
-    return [m for m in fitted if m not in plain]
+    sharp = [m for m in near if m not in able] if best.dispersion() > _MORE else []
+    soft = softened(*sets, list(best_by_effect(sharp, best).values())[:_FORMS], offered)
+    return [m for m in fitted if m not in plain] + soft
 
 
 def _sliding(

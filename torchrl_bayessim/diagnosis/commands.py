@@ -8,9 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..effects.effect import ActionEffect
 from ..effects.robot import Robot
-from ..effects.sequence import command_sequence
+from ..effects.sequence import command_sequence, in_stages
 from .segments import Segments
 from .strengths import Strengths
 
@@ -27,7 +26,7 @@ def commanded(
     size, at = len(segments), segments.history
     upto = at + segments.horizon
     window = torch.from_numpy(segments.ctrl[:, :upto])
-    kinds = [(e, s) for e, s in strengths.items() if isinstance(e, ActionEffect)]
+    kinds = [(effect, strengths[effect]) for effect in in_stages(strengths)]
     changed = np.zeros(count, dtype=bool)
     for _, values in kinds:
         changed |= values.any(1)

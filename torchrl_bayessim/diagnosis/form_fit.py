@@ -11,6 +11,7 @@ __all__ = [
     "bendable",
     "fitted_numbers",
     "priced",
+    "softened",
     "with_fitted_forms",
     "with_forms_anew",
     "with_slopes_of_forms",
@@ -33,6 +34,7 @@ _STEPS = 12  # of Gauss and Newton, at most
 _AFTER = 3  # steps of a fit after each
 _WHITER = 4.0  # times the price of a number, where a model leaves noise alone
 _SHORTER = (0.25, 0.05)  # of a step that leads nowhere better
+_LITTLE = 0.05  # of a law's range, to begin with
 _FARTHEST = 10.0  # times the change that shows, in one step: laws are not linear in these numbers
 
 
@@ -92,7 +94,71 @@ def with_fitted_forms(
     if not count:
         return placed
     needed = price(placed) * (_WHITER if placed.mean_square < WHITE else 1.0)
-    return _fitted(sets, placed, needed=LIKELY + count * needed, race=race)
+    fitted = _fitted(sets, placed, needed=LIKELY + count * needed, race=race)
+    return fitted if fitted is placed else _with_corners(sets, fitted, offered)
+
+
+def softened(
+    train: Objective, validation: Objective, models: Sequence[Model], offered: Collection[Unit]
+) -> list[Model]:
+    """Return models with laws that bend in the place of those that have a corner, fitted.
+
+    What a limit hardly ever cuts has no slope, and a fit ends where it begins: a soft law leads on,
+    and has a corner in the end if that explains as much. Models without such laws are left out.
+
+    Args:
+        train: Where models are fitted.
+        validation: Where they are judged.
+        models: To start from.
+        offered: Units with effects as they were offered, of which no number has been fitted.
+    """
+    starts = [start for model in models if (start := _soft(train, model, offered)) is not None]
+    soft = judged_fits(train, validation, starts) if starts else []
+    return [with_fitted_forms(train, validation, model, offered) for model in soft]
+
+
+def _soft(train: Objective, model: Model, offered: Collection[Unit]) -> Point | None:
+    """Return a model's point with bendable laws where it has others of these, nothing if none."""
+    laws = {(u.name, u.where, u.direction): u for u in offered if bendable(train, [u])}
+    instead = {
+        unit: laws[there]
+        for unit in model.units
+        if (there := (unit.name, unit.where, unit.direction)) in laws
+        and not bendable(train, [unit])
+    }
+    if not instead:
+        return None
+    strengths = model.fit.point.strengths
+    little = {instead[u]: u.inside(_LITTLE * np.sign(strengths[u]) * u.high) for u in instead}
+    return Point(
+        model.fit.point.z, {**{u: s for u, s in strengths.items() if u not in instead}, **little}
+    )
+
+
+def _with_corners(
+    sets: tuple[Objective, Objective], model: Model, offered: Collection[Unit]
+) -> Model:
+    """Return the model with laws that have a corner in the place of those as sharp as can be.
+
+    From afar only a soft law leads anywhere: what saturates hardly ever has no slope.
+    """
+    strengths = dict(model.fit.point.strengths)
+    sharpest = [s for s in _shifts(sets[0], model.units) if _value(s) <= s.least]
+    instead = {shift.unit: _corner(shift, offered) for shift in sharpest}
+    if not any(instead.values()):
+        return model
+    others = {instead.get(u) or u: s for u, s in strengths.items()}
+    start = Point(model.fit.point.z, {u: u.inside(s) for u, s in others.items()})
+    (sharp,) = judged_fits(*sets, [start])
+    return sharp if sharp.fit.cost < model.fit.cost + price(model) else model
+
+
+def _corner(shift: _Shift, offered: Collection[Unit]) -> Unit | None:
+    """Return the same effect where it was, as it was offered without the number, if it was."""
+    mine = shift.unit
+    there = mine.name, mine.where, mine.direction
+    alike = (u for u in offered if (u.name, u.where, u.direction) == there)
+    return next((u for u in alike if not u.effect.form.get(shift.number)), None)
 
 
 def bendable(train: Objective, units: Iterable[Unit]) -> bool:

@@ -40,7 +40,7 @@ _WRONG = 1.5  # mean squared innovation of a base that something is missing from
 _SURELY, _NOTHING = 50.0, 0.2  # gain, and share of what the base leaves: it was just this
 # likelihood ratio of what is plain elsewhere, times that of what another kind has there, and gain
 _PLAIN, _FAR, _SHOWN = 40.0, 1.5, 10.0
-_FARTHER, _LEAST = 3.0, 1e-4  # where noise alone seems left; and what it removes of the gap
+_LEAST = 1e-4  # of the gap: what it removes where noise alone seems left
 _DIFFERENT = 0.1  # of the change that an effect makes: what another makes differently
 
 
@@ -72,7 +72,7 @@ def identified(
         return True
     if seen is None or robot is None:
         return False
-    if not _elsewhere(base, better, seen, robot, far=_FAR if left else _FARTHER):
+    if not _elsewhere(base, better, seen, robot, beyond=0.0 if left else _PLAIN):
         return False
     return left or not numerical(start, base, better, timestep)
 
@@ -109,7 +109,7 @@ def stands_apart(base: Model, seen: Screen, robot: Robot) -> bool:
     """Return whether an effect shows elsewhere, however little of the gap is left to it."""
     told = _told(base, seen, robot)
     unit = max(told, key=lambda unit: told[unit], default=None)
-    return unit is not None and told[unit] > _apart_from(unit.effect.group, told, _FARTHER)
+    return unit is not None and told[unit] > _apart_from(unit.effect.group, told, _PLAIN)
 
 
 def numerical(start: Model, base: Model, better: Model, timestep: float) -> bool:
@@ -122,7 +122,7 @@ def numerical(start: Model, base: Model, better: Model, timestep: float) -> bool
     return _within_a_step(base, better, timestep)
 
 
-def _elsewhere(base: Model, better: Model, seen: Screen, robot: Robot, *, far: float) -> bool:
+def _elsewhere(base: Model, better: Model, seen: Screen, robot: Robot, *, beyond: float) -> bool:
     """Return whether one effect is added that no other law at the places of the base could be.
 
     Whatever is wrong with the form of a law is a force of its own joint, or an error of its own
@@ -134,7 +134,7 @@ def _elsewhere(base: Model, better: Model, seen: Screen, robot: Robot, *, far: f
         return False
     told = _told(base, seen, robot)
     mine = max((told.get(unit, 0.0) for unit in added), default=0.0)
-    return mine > _apart_from(added[0].effect.group, told, far)
+    return mine > _apart_from(added[0].effect.group, told, beyond)
 
 
 def surely_elsewhere(base: Model, better: Model, robot: Robot) -> bool:
@@ -155,10 +155,13 @@ def _told(base: Model, seen: Screen, robot: Robot) -> dict[Unit, float]:
     return seen.beside(near, base.dispersion())
 
 
-def _apart_from(group: str, told: Mapping[Unit, float], far: float) -> float:
-    """Return the likelihood ratio from which an effect of a group stands apart from all others."""
-    others = (ratio for unit, ratio in told.items() if unit.effect.group != group)
-    return max(_PLAIN, far * max(others, default=0.0))
+def _apart_from(group: str, told: Mapping[Unit, float], beyond: float) -> float:
+    """Return the likelihood ratio from which an effect of a group stands apart from all others.
+
+    So many times that of any of another group, and by ``beyond`` more.
+    """
+    other = max((r for unit, r in told.items() if unit.effect.group != group), default=0.0)
+    return max(_PLAIN, _FAR * other, other + beyond)
 
 
 def _places_of(model: Model, robot: Robot) -> set[tuple[str, int]]:

@@ -18,6 +18,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from ..effects.effect import Effect, SensorEffect
 from ..effects.robot import Robot
+from ..effects.sequence import in_stages
 from ..effects.units import unit_at
 from ..errors import message
 from ..inference.priors import BoxPrior
@@ -241,19 +242,23 @@ class Report:
             ValueError: An effect on sensors was found, and no channels are given.
         """
         strengths, named = self._strengths(channels), tuple(channels)
-        effects = [
-            ApplyEffect(e, dict(s), channels=named if isinstance(e, SensorEffect) else ())
+        effects = {
+            e: ApplyEffect(e, dict(s), channels=named if isinstance(e, SensorEffect) else ())
             for e, s in strengths.items()
-        ]
+        }
+        # the last of several transforms is the first that an action meets
+        last = in_stages(effects)[::-1]
+        chain: list[Any] = [effects[e] for e in (*last, *(e for e in effects if e not in last))]
         if physics is None:
-            for effect in effects:
+            for effect in chain:
                 env = TransformedEnv(env, effect, auto_unwrap=True)
             return env
-        pairs = zip(effects, strengths.values(), strict=True)
-        columns = [(effect, target) for effect, by_target in pairs for target in by_target]
+        columns = [
+            (effects[e], target) for e, by_target in strengths.items() for target in by_target
+        ]
         if columns:
             physics = EffectPhysics(physics, *columns)
-        chain: list[Any] = [ApplyPhysics(physics), *effects]
+        chain = [ApplyPhysics(physics), *chain]
         return TransformedEnv(env, Compose(*chain), auto_unwrap=True)
 
     def _strengths(self, channels: Sequence[str]) -> dict[Effect, Mapping[str, float]]:

@@ -20,12 +20,12 @@ from ..effects.action import ActionQuantization
 from .choice import chosen, fewest
 from .elimination import eliminated, without_stopgaps
 from .explanations import Round, bent, compare, explanations
-from .form_fit import with_fitted_forms, with_forms_anew
+from .form_fit import priced, softened, with_fitted_forms, with_forms_anew
 from .further_effects import identified, no_rival, nothing_left, stands_apart
 from .little_left import all_of_little, little_left, one_alone
 from .model import WHITE, Model, criterion, judged, judged_fits
 from .objective import Objective, Point, Unit
-from .refit import refit
+from .refit import Fit, refit
 from .rounded_commands import rounded
 from .screening import Screen
 from .shapes import with_shapes
@@ -34,6 +34,8 @@ from .wavering import waver
 Array = NDArray[np.float64]
 _MOST = 4  # effects in one explanation
 _HALF = 0.5  # of what is left
+_LESS, _FORMS = 0.05, 3  # of what is explained; models that explain all but that
+_MUCH = 5.0  # mean squared innovation: a law that is stuck where it began may leave as much
 _UNSEEN = 1.0  # a deviance, in units of the dispersion, that no test can detect
 
 
@@ -163,7 +165,13 @@ class Search:
             return None
         fitted = with_fitted_forms(*self.sets, exactly(*self.sets, better), self.offered)
         self.tried += [better, fitted]
-        return fitted
+        if fitted.dispersion() < _MUCH:
+            return fitted
+        # of what is alike between corners, such as a push and a bias before a limit, each
+        near = [m for m in models if m is not better and _nearly(now.base, better, m)]
+        soft = softened(*self.sets, [fitted, *near[:_FORMS]], self.offered)
+        self.tried += soft
+        return min([fitted, *soft], key=lambda model: priced(model, self.offered))
 
     def _better(self, best: Model, models: Sequence[Model], seen: Screen) -> Model | None:
         """Return the best model with more than the base, if that is worth it."""
@@ -187,6 +195,12 @@ class Search:
         needs = without_stopgaps(*self.sets, needs, self.offered)
         self.tried += [*dropped, needs]
         return needs
+
+
+def _nearly(base: Fit, better: Model, other: Model) -> bool:
+    """Return whether a model explains nearly as much on the runs of the fit."""
+    explained = base.cost - better.fit.cost
+    return other.fit.cost - better.fit.cost < _LESS * explained
 
 
 def _worth(start: Model, train: Objective) -> Callable[..., bool]:

@@ -44,6 +44,7 @@ class ActionDelay(ActionEffect):
     """
 
     name, unit, group = "action_delay", "s", "timing"
+    stage = 0
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 5 control steps, at most 0.1 s."""
@@ -69,6 +70,7 @@ class ActionJitter(ActionEffect):
     """Commands act late by another time at each step, uniform between 0 and ``s`` seconds."""
 
     name, unit, group, random = "action_jitter", "s", "timing", True
+    stage = 0
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 2 control steps."""
@@ -107,6 +109,7 @@ class ActionLag(ActionEffect):
     """
 
     name, unit, group = "action_lag", "s", "timing"
+    stage = 7
 
     def __init__(self, *, held: bool = True, second: float = 0.0) -> None:
         self.held, self.second = held, second
@@ -171,6 +174,7 @@ class DeadBand(ActionEffect):
     """
 
     name, unit, group, memoryless = "dead_band", "command", "dead zone", True
+    stage = 4
 
     def __init__(self, *, damped: bool = True, softness: float = 0.0) -> None:
         self.damped, self.softness = damped, softness
@@ -220,6 +224,7 @@ class Saturation(ActionEffect):
     """
 
     name, unit, group, memoryless = "saturation", "fraction", "gain", True
+    stage = 5
     limit = True
 
     def __init__(self, softness: float = 0.0) -> None:
@@ -263,6 +268,7 @@ class ActionGain(ActionEffect):
     """
 
     name, unit, group, memoryless = "action_gain", "fraction", "gain", True
+    stage = 2
 
     def __init__(self, bend: float = 0.0, *, servo: bool = False, damped: bool = True) -> None:
         self.bend, self.servo, self.damped = bend, servo, damped
@@ -303,6 +309,7 @@ class ActionBias(ActionEffect):
     """A constant is added: ``u + s``; in units of the command, up to 30 % of ``u_max``."""
 
     name, unit, group, memoryless = "action_bias", "command", "offset", True
+    stage = 1
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return ±0.3 ``u_max``."""
@@ -327,6 +334,7 @@ class BatterySag(ActionEffect):
     """
 
     name, unit, group, memoryless = "battery_sag", "fraction", "gain", True
+    stage = 6
 
     def __init__(self, seconds: float = 10.0, bend: float = 0.0) -> None:
         self.seconds, self.bend = seconds, bend
@@ -358,6 +366,7 @@ class PacketDrop(ActionEffect):
     """With probability ``s`` a command is lost, and the last one that arrived stays; 0 to 0.4."""
 
     name, unit, group, random = "packet_drop", "probability", "noise", True
+    stage = 0
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.4."""
@@ -379,6 +388,7 @@ class ActionQuantization(ActionEffect):
     """Commands are rounded to multiples of ``s``; in their units, 0 to 20 % of ``u_max``."""
 
     name, unit, group, memoryless = "action_quantization", "command", "noise", True
+    stage = 3
     graded = False
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:

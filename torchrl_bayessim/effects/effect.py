@@ -178,9 +178,15 @@ class Effect(ABC):
 
 
 class ActionEffect(Effect):
-    """Changes the command, at every control step; targets are actuators."""
+    """Changes the command, at every control step; targets are actuators.
+
+    Attributes:
+        stage: Where it is on the way from the controller to the joint, from 0: of several, those of
+            a lower stage act first. An offset before a limit is not one behind it.
+    """
 
     channel = "actuation"
+    stage: ClassVar[int] = 3
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the actuators' names."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-__all__ = ["command_sequence", "measured_sequence", "restored_sequence"]
+__all__ = ["command_sequence", "in_stages", "measured_sequence", "restored_sequence"]
 
+from collections.abc import Iterable
 from types import SimpleNamespace
 
 import torch
@@ -12,6 +13,19 @@ from torch import Tensor
 from ..randomness import generator
 from .effect import ActionEffect, Effect, Now, SensorEffect
 from .robot import Robot
+
+
+def in_stages(effects: Iterable[Effect]) -> list[ActionEffect]:
+    """Return the effects on commands in the order in which these reach them.
+
+    Example:
+        >>> from torchrl_bayessim.effects.catalogue import effect
+        >>> some = map(effect, ["saturation", "coulomb_friction", "action_bias", "action_delay"])
+        >>> [one.name for one in in_stages(some)]
+        ['action_delay', 'action_bias', 'saturation']
+    """
+    kinds = [one for one in effects if isinstance(one, ActionEffect)]
+    return sorted(kinds, key=lambda one: (one.stage, one.name))
 
 
 def command_sequence(
