@@ -1,20 +1,22 @@
 """What a law has beside its strength is fitted once the effect is in the model."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
+from plain_models import plain
 from rail_cart import cart, ride
 from test_diagnose import ARM, FINER, logs
 from test_diagnose import system as robot
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.form_fit import (
-    _corner,
+    _is_corner,
     _nearest_offered,
     _Shift,
-    _value,
+    _soft,
     softened,
     with_fitted_forms,
     with_forms_anew,
@@ -23,7 +25,9 @@ from torchrl_bayessim.diagnosis.model import judged
 from torchrl_bayessim.diagnosis.objective import Point, Unit, units_of
 from torchrl_bayessim.diagnosis.preparation import prepare
 from torchrl_bayessim.diagnosis.refit import refit
-from torchrl_bayessim.effects.action import ActionBias, Saturation
+from torchrl_bayessim.effects.action import ActionBias, ActionLag, DeadBand, Saturation
+from torchrl_bayessim.effects.friction import PreslidingFriction
+from torchrl_bayessim.effects.joints import CoulombFriction
 from torchrl_bayessim.effects.sensors import SensorDrift
 from torchrl_bayessim.effects.transmission import ServoGain
 from torchrl_bayessim.envs.task import Task
@@ -204,20 +208,42 @@ def test_a_hard_limit_is_found_from_afar_by_way_of_a_soft_one():
     assert strengths[bias] == pytest.approx(0.5, abs=0.02)
     assert sharp.mean_square < 1.2
     (stuck,) = judged(*sets, refit(sets[0], [Point(z, {hard: 0.2, bias: 0.1})], iterations=2))
-    (led,) = softened(*sets, [stuck], units)
+    (led,) = softened(*sets, [bent, stuck, stuck], units, most=1)
     assert dict(led.fit.point.strengths).keys() == {hard, bias}
     assert led.fit.cost == pytest.approx(sharp.fit.cost, rel=0.01)
-    assert not softened(*sets, [bent], units)  # it is soft already
+    assert not softened(*sets, [bent], units, most=1)  # it is soft already
 
 
-def test_a_law_with_a_corner_takes_the_place_of_the_sharpest_soft_one_only():
-    for softness, expected in ((0.1, True), (0.2, False)):
-        shift = _Shift(unit_of(Saturation(softness)), "softness", 0.02, 0.1, 1.0)
-        assert (_value(shift) <= shift.least) is expected
-    hard, elsewhere = unit_of(Saturation()), replace(unit_of(Saturation()), where="other")
-    shift = _Shift(unit_of(Saturation(0.1)), "softness", 0.02, 0.1, 1.0)
-    assert _corner(shift, [unit_of(Saturation(0.5)), elsewhere, hard]) == hard
-    assert _corner(shift, [unit_of(Saturation(0.5)), elsewhere]) is None
+SHIFTS = {"softness": (0.02, 0.1, 1.0), "presliding": (1e-4, 5e-4, 0.1), "second": (0.05, 0.0, 0.5)}
+
+
+@pytest.mark.parametrize(
+    ("soft", "number", "other", "is_one"),
+    [
+        (Saturation(0.1), "softness", Saturation(), True),
+        (Saturation(0.1), "softness", Saturation(0.5), False),
+        (DeadBand(softness=0.1), "softness", DeadBand(), True),
+        (DeadBand(softness=0.1), "softness", DeadBand(damped=False), False),
+        (PreslidingFriction(5e-4), "presliding", CoulombFriction(), True),
+        (ActionLag(held=False), "second", ActionLag(held=True), False),
+    ],
+)
+def test_the_corner_of_a_law_is_the_same_law_without_its_bend(soft, number, other, is_one):
+    shift = _Shift(unit_of(soft), number, *SHIFTS[number])
+    assert _is_corner(unit_of(other), shift) is is_one
+    assert not _is_corner(replace(unit_of(other), where="elsewhere"), shift)
+
+
+@pytest.mark.parametrize("strength", [0.3, 0.0])
+def test_a_limit_that_cuts_nothing_begins_as_a_soft_one_that_cuts_a_little(strength):
+    hard, soft, lag = units = [unit_of(e) for e in (Saturation(), Saturation(0.5), ActionLag())]
+    train = SimpleNamespace(
+        predictor=SimpleNamespace(system=robot()),
+        segments=SimpleNamespace(qpos=np.ones((1, 1, 1)), qvel=np.ones((1, 1, 1)), time=np.ones(1)),
+    )
+    model = plain({hard: strength, lag: 0.01}, 500.0)
+    assert _soft(train, model, units).strengths == {soft: 0.05, lag: 0.01}
+    assert _soft(train, plain({soft: 0.3, lag: 0.01}, 500.0), units) is None
 
 
 def unit_of(effect):

@@ -193,7 +193,7 @@ def _in_their_forms(
     plain = list(best_by_effect(able, best).values())[:_FORMS]
     fitted = [with_forms_anew(*sets, model, offered) for model in plain]
     sharp = [m for m in near if m not in able] if best.dispersion() > _MORE else []
-    soft = softened(*sets, list(best_by_effect(sharp, best).values())[:_FORMS], offered)
+    soft = softened(*sets, list(best_by_effect(sharp, best).values()), offered, most=_FORMS)
     return [m for m in fitted if m not in plain] + soft
 
 

@@ -45,7 +45,6 @@ _TOO_SHORT = (
     "sensors that are late were left out: over {} control steps they show what was measured before"
 )
 _NEARLY = 2.0  # mean squared innovation of what seems to leave noise alone
-_FAR_LESS = 0.3  # mean squared innovation: noise was so much less that nothing was compared well
 _JITTER = 0.05  # of the control step; times since 1970 are rounded
 
 
@@ -160,8 +159,7 @@ def _beside_noise(
     if selection.best.mean_square < _NEARLY:
         quieter = with_less_noise(prepared, selection.best.fit.point, generator=generator)
         if quieter is not None:
-            told = selection.best.mean_square > _FAR_LESS
-            return quieter.alarms, *search(quieter, known=selection if told else None)
+            return quieter.alarms, *search(quieter, known=selection)
     return alarms, prepared, selection
 
 

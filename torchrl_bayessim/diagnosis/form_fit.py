@@ -19,6 +19,7 @@ __all__ = [
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +100,12 @@ def with_fitted_forms(
 
 
 def softened(
-    train: Objective, validation: Objective, models: Sequence[Model], offered: Collection[Unit]
+    train: Objective,
+    validation: Objective,
+    models: Sequence[Model],
+    offered: Collection[Unit],
+    *,
+    most: int,
 ) -> list[Model]:
     """Return models with laws that bend in the place of those that have a corner, fitted.
 
@@ -111,28 +117,32 @@ def softened(
         validation: Where they are judged.
         models: To start from.
         offered: Units with effects as they were offered, of which no number has been fitted.
+        most: Of how many models, the first that have such laws.
     """
-    starts = [start for model in models if (start := _soft(train, model, offered)) is not None]
+    each = (_soft(train, model, offered) for model in models)
+    starts = list(islice((start for start in each if start is not None), most))
     soft = judged_fits(train, validation, starts) if starts else []
     return [with_fitted_forms(train, validation, model, offered) for model in soft]
 
 
 def _soft(train: Objective, model: Model, offered: Collection[Unit]) -> Point | None:
-    """Return a model's point with bendable laws where it has others of these, nothing if none."""
-    laws = {(u.name, u.where, u.direction): u for u in offered if bendable(train, [u])}
+    """Return a model's point with soft laws, of little strength, for those with a corner, if any.
+
+    Nothing where it has none.
+    """
+    bends = [shift for shift in _shifts(train, offered) if shift.least > 0.0]
     instead = {
-        unit: laws[there]
+        unit: next((shift.unit for shift in bends if _is_corner(unit, shift)), None)
         for unit in model.units
-        if (there := (unit.name, unit.where, unit.direction)) in laws
-        and not bendable(train, [unit])
     }
-    if not instead:
+    if not any(instead.values()):
         return None
-    strengths = model.fit.point.strengths
-    little = {instead[u]: u.inside(_LITTLE * np.sign(strengths[u]) * u.high) for u in instead}
-    return Point(
-        model.fit.point.z, {**{u: s for u, s in strengths.items() if u not in instead}, **little}
-    )
+    strengths: dict[Unit, float] = {}
+    for unit, strength in model.fit.point.strengths.items():
+        soft = instead[unit]
+        side = np.sign(strength) or 1.0
+        strengths[soft or unit] = soft.inside(_LITTLE * side * soft.high) if soft else strength
+    return Point(model.fit.point.z, strengths)
 
 
 def _with_corners(
@@ -142,23 +152,31 @@ def _with_corners(
 
     From afar only a soft law leads anywhere: what saturates hardly ever has no slope.
     """
-    strengths = dict(model.fit.point.strengths)
-    sharpest = [s for s in _shifts(sets[0], model.units) if _value(s) <= s.least]
-    instead = {shift.unit: _corner(shift, offered) for shift in sharpest}
-    if not any(instead.values()):
-        return model
-    others = {instead.get(u) or u: s for u, s in strengths.items()}
-    start = Point(model.fit.point.z, {u: u.inside(s) for u, s in others.items()})
-    (sharp,) = judged_fits(*sets, [start])
-    return sharp if sharp.fit.cost < model.fit.cost + price(model) else model
+    for shift in _shifts(sets[0], model.units):
+        if not 0.0 < _value(shift) <= shift.least:
+            continue
+        corner = next((unit for unit in offered if _is_corner(unit, shift)), None)
+        if corner is not None:
+            strengths = model.fit.point.strengths
+            other = {corner if u == shift.unit else u: s for u, s in strengths.items()}
+            start = Point(model.fit.point.z, {u: u.inside(s) for u, s in other.items()})
+            (sharp,) = judged_fits(*sets, [start])
+            # a number less, too
+            model = sharp if sharp.fit.cost < model.fit.cost + price(model) else model
+    return model
 
 
-def _corner(shift: _Shift, offered: Collection[Unit]) -> Unit | None:
-    """Return the same effect where it was, as it was offered without the number, if it was."""
-    mine = shift.unit
-    there = mine.name, mine.where, mine.direction
-    alike = (u for u in offered if (u.name, u.where, u.direction) == there)
-    return next((u for u in alike if not u.effect.form.get(shift.number)), None)
+def _is_corner(unit: Unit, shift: _Shift) -> bool:
+    """Return whether a unit is what the other becomes where its bend has no width.
+
+    The same effect at the same place, the same but for that number, which is 0 or which it has not.
+    """
+    soft = shift.unit
+    if (unit.name, unit.where, unit.direction) != (soft.name, soft.where, soft.direction):
+        return False
+    mine, others = dict(unit.effect.form), dict(soft.effect.form)
+    del others[shift.number]
+    return not mine.pop(shift.number, 0.0) and mine == others
 
 
 def bendable(train: Objective, units: Iterable[Unit]) -> bool:

@@ -158,7 +158,7 @@ def _told(base: Model, seen: Screen, robot: Robot) -> dict[Unit, float]:
 def _apart_from(group: str, told: Mapping[Unit, float], beyond: float) -> float:
     """Return the likelihood ratio from which an effect of a group stands apart from all others.
 
-    So many times that of any of another group, and by ``beyond`` more.
+    It is so many times that of any of another group, and larger by ``beyond`` at least.
     """
     other = max((r for unit, r in told.items() if unit.effect.group != group), default=0.0)
     return max(_PLAIN, _FAR * other, other + beyond)

@@ -29,7 +29,7 @@ SPOILED = (0.003, 0.01, 0.03, 0.1, 0.3)  # η
 LIKELIER = 0.5  # probability that a segment has a loss, or is spoiled
 NOISE = 1.2  # scatter that noise has
 FEWEST = 4  # segments with a loss
-_MISSING = 1e-4  # p-value of what effects that last leave, to be more than chance
+_MISSING = 1e-4  # p-value of the search's last round, which says that more than chance is left
 LEFT = 2.0  # mean squared innovation of what has not explained the losses
 
 

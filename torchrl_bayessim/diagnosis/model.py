@@ -164,16 +164,17 @@ def shown(base: Model, model: Model) -> bool:
 
 
 def shown_together(base: Model, model: Model) -> bool:
-    """Return whether all runs together show what is better than little more than noise.
+    """Return whether all runs together show that a model is better than little more than noise.
 
-    A single run has to show it twice as surely: it may be odd.
+    Those that judge may not say the opposite. A single run has to show it twice as surely: it may
+    be odd.
     """
     gains = (base.deviances() - model.deviances()) / model.dispersion()
     each, least = np.bincount(model.logs, gains), needed(base, model)
     together, alone = float(each.sum()), float(each.max())
     several = together - alone > least
     sure = together > _TOGETHER * least * (1.0 if several else 2.0)
-    return base.mean_square < WHITE and sure
+    return base.mean_square < WHITE and sure and gain(base, model) >= 0
 
 
 def as_good(best: Model, rival: Model) -> bool:

@@ -19,7 +19,7 @@ from .style import STYLE
 _MEANING = {
     "none": "nothing is missing",
     "named": "the cause explains the gap",
-    "named_partial": "the cause explains most of the gap",
+    "named_partial": "the cause explains most of the gap, or more than test runs show",
     "ambiguous": "several causes explain it equally well",
     "unknown": "the gap is real, its cause is not in the catalogue",
     "not_testable": "these data cannot say",

@@ -154,7 +154,8 @@ class Report:
 
     Attributes:
         verdict: ``none``: nothing is missing. ``named``: the effects explain the gap.
-            ``named_partial``: they explain most of it, and the rest is located. ``ambiguous``:
+            ``named_partial``: they explain most of it, and the rest is located, or test runs show
+            too little of it to say how much they explain. ``ambiguous``:
             several effects explain it equally well. ``unknown``: the gap is real, and nothing in
             the catalogue explains it. ``not_testable``: these data cannot say.
         summary: One sentence.
@@ -227,6 +228,9 @@ class Report:
         self, env: EnvBase, physics: Physics | None = None, *, channels: Sequence[str] = ()
     ) -> EnvBase:
         """Return the environment with the effects that were found.
+
+        Of several effects on commands those of a lower `ActionEffect.stage` act first, as in the
+        diagnosis. Of several transforms the last one is the first that an action meets.
 
         With ``physics``, strengths are parameters too: the environment's θ has the columns of
         ``physics``, then one for each strength, in the order of `prior`. A reset without θ brings

@@ -169,7 +169,8 @@ class Search:
             return fitted
         # of what is alike between corners, such as a push and a bias before a limit, each
         near = [m for m in models if m is not better and _nearly(now.base, better, m)]
-        soft = softened(*self.sets, [fitted, *near[:_FORMS]], self.offered)
+        near.sort(key=lambda model: model.fit.cost)
+        soft = softened(*self.sets, [fitted, *near], self.offered, most=_FORMS)
         self.tried += soft
         return min([fitted, *soft], key=lambda model: priced(model, self.offered))
 
@@ -198,9 +199,10 @@ class Search:
 
 
 def _nearly(base: Fit, better: Model, other: Model) -> bool:
-    """Return whether a model explains nearly as much on the runs of the fit."""
+    """Return whether as few effects explain nearly as much on the runs of the fit."""
     explained = base.cost - better.fit.cost
-    return other.fit.cost - better.fit.cost < _LESS * explained
+    few = len(other.names) <= len(better.names)
+    return few and other.fit.cost - better.fit.cost < _LESS * explained
 
 
 def _worth(start: Model, train: Objective) -> Callable[..., bool]:

@@ -10,7 +10,8 @@ how much of it the effects explain, not only whether it is significant::
     named_partial  effects explain at least 40 %; the rest is located. Or 80 % on validation runs,
                    where test runs hardly show the gap. Or perhaps 40 %, of a cause that is certain
                    and surely helps on test runs, and leaves less than the noise once more. Or of a
-                   gap no larger than noise what all other runs together show beyond doubt
+                   gap hardly above noise what all other runs together show (p < 1e-4), or chance
+                   that is certain, where test runs do not speak against it
     ambiguous      effects of different kinds explain the data equally well
     unknown        the gap is real, and the catalogue explains less than 40 % of it, or perhaps none
     not_testable   the data are too few or too uniform to say
@@ -48,7 +49,7 @@ from .validation import (
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
 _PLAIN = 4.0  # the same, to need no interval: few segments have a wide one, as about impacts
 _CERTAIN = 1e-15  # p-value of a gap that is too small to be seen at a glance
-_DOUBTLESS = 1e-4  # the same, where an effect removes it from all runs
+_DOUBTLESS = 1e-4  # the same, where all runs of the search together show an effect
 _MOST = 0.5  # of the joints without measured velocity
 _NOISE_AGAIN = 2.0  # mean squared innovation: as much again as the noise
 _ALL = 0.98
@@ -147,7 +148,8 @@ class _Weighed:
         unsaid: Whether test runs do not say that what was found explains it.
         elsewhere: Whether validation runs do in their place.
         helps: Whether it surely helps on test runs, however much of the gap it explains.
-        together: Whether all other runs together show it, of a gap that is no larger than noise.
+        together: Whether all other runs together show it, of a gap that is hardly above noise, or
+            it is chance and certain.
         several: Whether several effects were found.
     """
 

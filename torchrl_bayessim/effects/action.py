@@ -44,7 +44,7 @@ class ActionDelay(ActionEffect):
     """
 
     name, unit, group = "action_delay", "s", "timing"
-    stage = 0
+    stage = 2
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 5 control steps, at most 0.1 s."""
@@ -70,7 +70,7 @@ class ActionJitter(ActionEffect):
     """Commands act late by another time at each step, uniform between 0 and ``s`` seconds."""
 
     name, unit, group, random = "action_jitter", "s", "timing", True
-    stage = 0
+    stage = 1
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 2 control steps."""
@@ -109,7 +109,7 @@ class ActionLag(ActionEffect):
     """
 
     name, unit, group = "action_lag", "s", "timing"
-    stage = 7
+    stage = 10
 
     def __init__(self, *, held: bool = True, second: float = 0.0) -> None:
         self.held, self.second = held, second
@@ -174,7 +174,7 @@ class DeadBand(ActionEffect):
     """
 
     name, unit, group, memoryless = "dead_band", "command", "dead zone", True
-    stage = 4
+    stage = 7
 
     def __init__(self, *, damped: bool = True, softness: float = 0.0) -> None:
         self.damped, self.softness = damped, softness
@@ -224,7 +224,7 @@ class Saturation(ActionEffect):
     """
 
     name, unit, group, memoryless = "saturation", "fraction", "gain", True
-    stage = 5
+    stage = 8
     limit = True
 
     def __init__(self, softness: float = 0.0) -> None:
@@ -268,7 +268,7 @@ class ActionGain(ActionEffect):
     """
 
     name, unit, group, memoryless = "action_gain", "fraction", "gain", True
-    stage = 2
+    stage = 5
 
     def __init__(self, bend: float = 0.0, *, servo: bool = False, damped: bool = True) -> None:
         self.bend, self.servo, self.damped = bend, servo, damped
@@ -309,7 +309,7 @@ class ActionBias(ActionEffect):
     """A constant is added: ``u + s``; in units of the command, up to 30 % of ``u_max``."""
 
     name, unit, group, memoryless = "action_bias", "command", "offset", True
-    stage = 1
+    stage = 4
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return ±0.3 ``u_max``."""
@@ -334,7 +334,7 @@ class BatterySag(ActionEffect):
     """
 
     name, unit, group, memoryless = "battery_sag", "fraction", "gain", True
-    stage = 6
+    stage = 9
 
     def __init__(self, seconds: float = 10.0, bend: float = 0.0) -> None:
         self.seconds, self.bend = seconds, bend

@@ -181,12 +181,14 @@ class ActionEffect(Effect):
     """Changes the command, at every control step; targets are actuators.
 
     Attributes:
-        stage: Where it is on the way from the controller to the joint, from 0: of several, those of
-            a lower stage act first. An offset before a limit is not one behind it.
+        stage: Where it is on the way from the controller to the joint: of several, those of a lower
+            stage act first. An offset before a limit is not one behind it. Those of the catalogue
+            have 0 (lost packets) to 10 (a lag); 6, the default, is behind offsets and gains, and
+            before dead bands and limits.
     """
 
     channel = "actuation"
-    stage: ClassVar[int] = 3
+    stage: ClassVar[int] = 6
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the actuators' names."""

@@ -16,7 +16,7 @@ from .robot import Robot
 
 
 def in_stages(effects: Iterable[Effect]) -> list[ActionEffect]:
-    """Return the effects on commands in the order in which these reach them.
+    """Return the effects on commands in the order in which they act (`ActionEffect.stage`).
 
     Example:
         >>> from torchrl_bayessim.effects.catalogue import effect

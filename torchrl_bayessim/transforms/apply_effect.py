@@ -36,7 +36,7 @@ class ApplyEffect(Transform):
     an environment resets. Beside an `ApplyPhysics`, put it after that: at a reset the parameters
     are written first, and the effect changes what is then in force, never its own last change.
     Effects on the model are written after the simulator's own reset, whose observation is the one
-    without them.
+    without them. Of several around one environment the last is the first that an action meets.
 
     Args:
         effect: The effect, or its name in the catalogue.
