@@ -94,3 +94,14 @@ def test_what_explains_nearly_as_much_is_bent_to_the_data(monkeypatch):
     found = alternatives._in_their_forms(("train", "validation"), best, known, [], start=start)
     assert set(bent) == {near[0], near[2]}
     assert found == [bent[near[0]]]
+
+
+@pytest.mark.parametrize(("left", "count"), [(2400.0, 1), (1600.0, 0)])
+def test_laws_with_a_corner_are_softened_where_much_is_left(monkeypatch, left, count):
+    monkeypatch.setattr(alternatives, "bendable", lambda *_: False)
+    monkeypatch.setattr(alternatives, "softened", lambda _, __, models, ___, *, most: models[:most])
+    start, best, near = plain([], 1e6), plain([OFFSET], left), plain([PAYLOAD], 1.1 * left)
+    known = [near, plain([DRAG], 2e5)]
+    sets = "train", "validation"
+    found = alternatives._in_their_forms(sets, best, known, [], start=start)
+    assert found == [near] * count

@@ -1,33 +1,25 @@
 """What a law has beside its strength is fitted once the effect is in the model."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
-from plain_models import plain
 from rail_cart import cart, ride
 from test_diagnose import ARM, FINER, logs
 from test_diagnose import system as robot
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.form_fit import (
-    _is_corner,
     _nearest_offered,
-    _Shift,
-    _soft,
-    softened,
-    with_fitted_forms,
     with_forms_anew,
 )
+from torchrl_bayessim.diagnosis.free_numbers import Shift
 from torchrl_bayessim.diagnosis.model import judged
 from torchrl_bayessim.diagnosis.objective import Point, Unit, units_of
 from torchrl_bayessim.diagnosis.preparation import prepare
 from torchrl_bayessim.diagnosis.refit import refit
-from torchrl_bayessim.effects.action import ActionBias, ActionLag, DeadBand, Saturation
-from torchrl_bayessim.effects.friction import PreslidingFriction
-from torchrl_bayessim.effects.joints import CoulombFriction
+from torchrl_bayessim.effects.action import Saturation
 from torchrl_bayessim.effects.sensors import SensorDrift
 from torchrl_bayessim.effects.transmission import ServoGain
 from torchrl_bayessim.envs.task import Task
@@ -37,7 +29,6 @@ SOME = (
     "cogging", "coulomb_friction", "parallel_spring", "periodic_disturbance", "sensor_drift",
     "viscous_friction",
 )  # fmt: skip
-ARMS = robot().robot
 FREQUENCY, PHASE, RATE = 1.37, 0.6, 31.0
 
 
@@ -180,70 +171,11 @@ def test_a_drift_that_was_taken_to_settle_is_steady_again():
     ("softness", "expected"), [(0.22, 0.5), (0.9, 0.5)], ids=["nearly hard", "soft"]
 )
 def test_what_is_straightened_is_a_law_that_was_offered_and_can_be_fitted(softness, expected):
-    shift = _Shift(unit_of(Saturation(softness)), "softness", 0.02, 0.1, 1.0)
+    shift = Shift(unit_of(Saturation(softness)), "softness", 0.02, 0.1, 1.0)
     offered = [unit_of(Saturation()), unit_of(Saturation(0.5)), unit_of(ServoGain())]
     assert _nearest_offered(shift, offered) == expected
     assert shift.paid(offered)
-    assert not _Shift(unit_of(Saturation(0.5)), "softness", 0.02, 0.1, 1.0).paid(offered)
-
-
-def limited(u, k):
-    """A motor that is told a little more than it should be, and cuts what is too much."""
-    return float(np.clip(u[k] + 0.5, -1.5, 1.5))
-
-
-def test_a_hard_limit_is_found_from_afar_by_way_of_a_soft_one():
-    """From a limit of nearly all commands, where half as hard a one does not cut any less."""
-    units = [u for e in (Saturation(), Saturation(0.5), ActionBias()) for u in units_of([e], ARMS)]
-    hard, soft, bias = units
-    known = prepare(robot(), logs(act=limited), units, generator=np.random.default_rng(0))
-    sets = known.sets["train"], known.sets["validation"]
-    z = known.nominal.point.z
-    (bent,) = judged(*sets, refit(sets[0], [Point(z, {soft: 0.05, bias: 0.1})]))
-    assert bent.mean_square > 2.0
-    sharp = with_fitted_forms(*sets, bent, units)
-    strengths = dict(sharp.fit.point.strengths)
-    assert strengths.keys() == {hard, bias}
-    assert strengths[hard] == pytest.approx(1 - 1.5 / 4, abs=0.01)
-    assert strengths[bias] == pytest.approx(0.5, abs=0.02)
-    assert sharp.mean_square < 1.2
-    (stuck,) = judged(*sets, refit(sets[0], [Point(z, {hard: 0.2, bias: 0.1})], iterations=2))
-    (led,) = softened(*sets, [bent, stuck, stuck], units, most=1)
-    assert dict(led.fit.point.strengths).keys() == {hard, bias}
-    assert led.fit.cost == pytest.approx(sharp.fit.cost, rel=0.01)
-    assert not softened(*sets, [bent], units, most=1)  # it is soft already
-
-
-SHIFTS = {"softness": (0.02, 0.1, 1.0), "presliding": (1e-4, 5e-4, 0.1), "second": (0.05, 0.0, 0.5)}
-
-
-@pytest.mark.parametrize(
-    ("soft", "number", "other", "is_one"),
-    [
-        (Saturation(0.1), "softness", Saturation(), True),
-        (Saturation(0.1), "softness", Saturation(0.5), False),
-        (DeadBand(softness=0.1), "softness", DeadBand(), True),
-        (DeadBand(softness=0.1), "softness", DeadBand(damped=False), False),
-        (PreslidingFriction(5e-4), "presliding", CoulombFriction(), True),
-        (ActionLag(held=False), "second", ActionLag(held=True), False),
-    ],
-)
-def test_the_corner_of_a_law_is_the_same_law_without_its_bend(soft, number, other, is_one):
-    shift = _Shift(unit_of(soft), number, *SHIFTS[number])
-    assert _is_corner(unit_of(other), shift) is is_one
-    assert not _is_corner(replace(unit_of(other), where="elsewhere"), shift)
-
-
-@pytest.mark.parametrize("strength", [0.3, 0.0])
-def test_a_limit_that_cuts_nothing_begins_as_a_soft_one_that_cuts_a_little(strength):
-    hard, soft, lag = units = [unit_of(e) for e in (Saturation(), Saturation(0.5), ActionLag())]
-    train = SimpleNamespace(
-        predictor=SimpleNamespace(system=robot()),
-        segments=SimpleNamespace(qpos=np.ones((1, 1, 1)), qvel=np.ones((1, 1, 1)), time=np.ones(1)),
-    )
-    model = plain({hard: strength, lag: 0.01}, 500.0)
-    assert _soft(train, model, units).strengths == {soft: 0.05, lag: 0.01}
-    assert _soft(train, plain({soft: 0.3, lag: 0.01}, 500.0), units) is None
+    assert not Shift(unit_of(Saturation(0.5)), "softness", 0.02, 0.1, 1.0).paid(offered)
 
 
 def unit_of(effect):

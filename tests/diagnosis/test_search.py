@@ -1,8 +1,11 @@
 """Rounds that add to a model, and what they take out again."""
 
+from types import SimpleNamespace
+
 import pytest
 from plain_models import A, C, Unit, plain
 
+from torchrl_bayessim.diagnosis import search as searching
 from torchrl_bayessim.diagnosis.search import Search
 
 WEAK = Unit("magnets", "hip")
@@ -47,3 +50,26 @@ def test_nothing_is_searched_again_where_all_is_needed():
     search = Scripted({(): alone}, {})
     assert search.best() is alone
     assert search.asked == [(), (A,)]
+
+
+@pytest.mark.parametrize(("left", "led"), [(2400.0, True), (1600.0, False)])
+def test_where_much_is_left_a_limit_is_led_to_and_what_is_alike_too(monkeypatch, left, led):
+    """A push was preferred to a bias before the limit, between which corners do not tell."""
+    push, bias = (plain([A, other], left + i) for i, other in enumerate((C, WEAK)))
+    others = [plain([A, C, WEAK], left - 100), plain([A], 5e5), bias, push]
+    soft, given = plain([A, WEAK], 410.0), []
+
+    def softened(_, __, models, ___, *, most):
+        given.extend(models)
+        return [plain([A, C], 600.0), soft][:most]
+
+    monkeypatch.setattr(searching, "explanations", lambda *_: [])
+    monkeypatch.setattr(searching, "judged", lambda *_: others)
+    monkeypatch.setattr(searching, "exactly", lambda _, __, model: model)
+    monkeypatch.setattr(searching, "with_fitted_forms", lambda _, __, model, ___: model)
+    monkeypatch.setattr(searching, "softened", softened)
+    search = Scripted({}, {})
+    search.sets, search.varied, search.tried, search.offered = ("train", "judge"), False, [], []
+    found = search._explained(SimpleNamespace(base=plain([], 1e6).fit), lambda _: push)
+    assert found is (soft if led else push)
+    assert given == ([push, bias] if led else [])

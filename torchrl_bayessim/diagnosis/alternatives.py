@@ -18,14 +18,8 @@ from ..effects.effect import Effect
 from ..effects.joints import CoulombFriction
 from ..effects.transmission import ServoDeadBand
 from .explanations import compare
-from .form_fit import (
-    bendable,
-    fitted_numbers,
-    priced,
-    softened,
-    with_fitted_forms,
-    with_forms_anew,
-)
+from .form_fit import softened, with_fitted_forms, with_forms_anew
+from .free_numbers import bendable, fitted_numbers, priced
 from .model import (
     LIKELY,
     Model,

@@ -6,7 +6,8 @@ __all__ = ["chosen", "fewest"]
 
 from collections.abc import Callable, Mapping, Sequence
 
-from .form_fit import bendable, fitted_numbers, priced, with_fitted_forms
+from .form_fit import with_fitted_forms
+from .free_numbers import bendable, fitted_numbers, priced
 from .model import (
     WHITE,
     Model,

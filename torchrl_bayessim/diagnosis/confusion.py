@@ -13,7 +13,7 @@ from ..effects.joints import Armature
 from ..effects.transmission import ServoDeadBand
 from .alternatives import kind, leaves_less_to_do
 from .elimination import parts, without_idle
-from .form_fit import priced
+from .free_numbers import priced
 from .model import Model, as_good, judged_fits
 from .objective import Objective, Point
 from .selection import Selection

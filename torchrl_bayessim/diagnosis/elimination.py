@@ -14,7 +14,8 @@ from functools import partial
 
 import numpy as np
 
-from .form_fit import bendable, priced, with_forms_anew
+from .form_fit import with_forms_anew
+from .free_numbers import bendable, priced
 from .model import Model, as_good, criterion, judged, judged_fits, shown
 from .objective import Objective, Point, Unit
 from .refit import refit

@@ -20,7 +20,8 @@ from ..effects.action import ActionQuantization
 from .choice import chosen, fewest
 from .elimination import eliminated, without_stopgaps
 from .explanations import Round, bent, compare, explanations
-from .form_fit import priced, softened, with_fitted_forms, with_forms_anew
+from .form_fit import softened, with_fitted_forms, with_forms_anew
+from .free_numbers import priced
 from .further_effects import identified, no_rival, nothing_left, stands_apart
 from .little_left import all_of_little, little_left, one_alone
 from .model import WHITE, Model, criterion, judged, judged_fits

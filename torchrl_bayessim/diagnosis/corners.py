@@ -1,0 +1,69 @@
+"""Laws with a corner, such as a limit, and the soft ones that lead a fit to them."""
+
+from __future__ import annotations
+
+__all__ = ["is_corner", "soft_start", "with_corners"]
+
+from collections.abc import Collection
+
+import numpy as np
+
+from .free_numbers import Shift, shifts_of, value_of
+from .model import Model, judged_fits, price
+from .objective import Objective, Point, Unit
+
+_LITTLE = 0.05  # of a law's range, to begin with
+
+
+def soft_start(train: Objective, model: Model, offered: Collection[Unit]) -> Point | None:
+    """Return a model's point with soft laws, of little strength, for those with a corner, if any.
+
+    Nothing where it has none.
+    """
+    bends = [shift for shift in shifts_of(train, offered) if shift.least > 0.0]
+    instead = {
+        unit: next((shift.unit for shift in bends if is_corner(unit, shift)), None)
+        for unit in model.units
+    }
+    if not any(instead.values()):
+        return None
+    strengths: dict[Unit, float] = {}
+    for unit, strength in model.fit.point.strengths.items():
+        soft = instead[unit]
+        side = np.sign(strength) or 1.0
+        strengths[soft or unit] = soft.inside(_LITTLE * side * soft.high) if soft else strength
+    return Point(model.fit.point.z, strengths)
+
+
+def with_corners(
+    sets: tuple[Objective, Objective], model: Model, offered: Collection[Unit]
+) -> Model:
+    """Return the model with laws that have a corner in the place of those as sharp as can be.
+
+    From afar only a soft law leads anywhere: what saturates hardly ever has no slope.
+    """
+    for shift in shifts_of(sets[0], model.units):
+        if not 0.0 < value_of(shift) <= shift.least:
+            continue
+        corner = next((unit for unit in offered if is_corner(unit, shift)), None)
+        if corner is not None:
+            strengths = model.fit.point.strengths
+            other = {corner if u == shift.unit else u: s for u, s in strengths.items()}
+            start = Point(model.fit.point.z, {u: u.inside(s) for u, s in other.items()})
+            (sharp,) = judged_fits(*sets, [start])
+            # a number less, too
+            model = sharp if sharp.fit.cost < model.fit.cost + price(model) else model
+    return model
+
+
+def is_corner(unit: Unit, shift: Shift) -> bool:
+    """Return whether a unit is what the other becomes where its bend has no width.
+
+    The same effect at the same place, the same but for that number, which is 0 or which it has not.
+    """
+    soft = shift.unit
+    if (unit.name, unit.where, unit.direction) != (soft.name, soft.where, soft.direction):
+        return False
+    mine, others = dict(unit.effect.form), dict(soft.effect.form)
+    del others[shift.number]
+    return not mine.pop(shift.number, 0.0) and mine == others
