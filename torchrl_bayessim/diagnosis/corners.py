@@ -40,7 +40,7 @@ def with_corners(
 ) -> Model:
     """Return the model with laws that have a corner in the place of those as sharp as can be.
 
-    From afar only a soft law leads anywhere: what saturates hardly ever has no slope.
+    From afar only a soft law leads there: a limit that hardly ever cuts has no slope.
     """
     for shift in shifts_of(sets[0], model.units):
         if not 0.0 < value_of(shift) <= shift.least:
