@@ -8,7 +8,7 @@ from rotor_and_link import gap, one_body, spring, two_bodies
 
 from torchrl_bayessim.diagnosis.candidates import strength_errors
 from torchrl_bayessim.diagnosis.diagnose import diagnose
-from torchrl_bayessim.diagnosis.form_fit import _Shift
+from torchrl_bayessim.diagnosis.free_numbers import Shift
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.refit import Fit
 from torchrl_bayessim.effects.catalogue import effect
@@ -75,7 +75,7 @@ def test_what_is_between_rotor_and_link_is_named_with_its_size(name, shaft, with
 
 
 def test_the_damping_of_a_shaft_is_fitted_in_any_case():
-    shift = _Shift(units_of([effect("series_elasticity")], robot_of(described()))[0], "damping",
+    shift = Shift(units_of([effect("series_elasticity")], robot_of(described()))[0], "damping",
                    0.01, 0.01, 0.9)  # fmt: skip
     assert shift.paid([shift.unit])
 
