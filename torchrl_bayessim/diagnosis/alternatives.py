@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 
+from ..effects.bodies import Payload
 from ..effects.contacts import ContactFriction
 from ..effects.effect import Effect
 from ..effects.joints import CoulombFriction
@@ -147,16 +148,16 @@ def _of_one_law(
     kept: Mapping[Unit, float],
     offered: Collection[Unit],
 ) -> list[Model]:
-    """Return bent laws of its kind, beside others, in the place of an effect at several places.
+    """Return bent laws of masses, beside others, in the place of such an effect at several places.
 
     Centres of mass that are shifted along several axes may be one payload, held aside, beside which
     a spring hardens: neither law alone comes near before both are bent.
     """
     mine = [unit for unit in best.units if unit not in kept]
-    if not kept or len(mine) < 2:
-        return []
-    names, kinds = {u.name for u in mine}, {kind(u.effect) for u in mine}
-    alike = [u for u in offered if u.name not in names and kind(u.effect) in kinds]
+    if not kept or len(mine) < 2 or {u.effect.group for u in mine} != {Payload.group}:
+        return []  # friction at one joint is none at several
+    names = {unit.name for unit in mine}
+    alike = [u for u in offered if u.name not in names and u.effect.group == Payload.group]
     laws = [u for u in alike if u.where != "all" and bendable(sets[0], [u])]
     z = best.fit.point.z
     starts = [Point(z, {**kept, u: u.inside(_LITTLE * u.high)}) for u in laws]

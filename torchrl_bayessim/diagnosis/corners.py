@@ -8,6 +8,7 @@ from collections.abc import Collection
 
 import numpy as np
 
+from ..effects.effect import ActionEffect
 from .free_numbers import Shift, shifts_of, value_of
 from .model import Model, judged_fits, price
 from .objective import Objective, Point, Unit
@@ -18,18 +19,19 @@ _LITTLE = 0.05  # of a law's range, to begin with
 def soft_start(train: Objective, model: Model, offered: Collection[Unit]) -> Point | None:
     """Return a model's point with soft laws, of little strength, for those with a corner, if any.
 
-    Nothing where it has none.
+    Nothing where it has none. Of effects on commands only: dry friction has a slope.
     """
     bends = [shift for shift in shifts_of(train, offered) if shift.least > 0.0]
     instead = {
         unit: next((shift.unit for shift in bends if is_corner(unit, shift)), None)
         for unit in model.units
+        if isinstance(unit.effect, ActionEffect)
     }
     if not any(instead.values()):
         return None
     strengths: dict[Unit, float] = {}
     for unit, strength in model.fit.point.strengths.items():
-        soft = instead[unit]
+        soft = instead.get(unit)
         side = np.sign(strength) or 1.0
         strengths[soft or unit] = soft.inside(_LITTLE * side * soft.high) if soft else strength
     return Point(model.fit.point.z, strengths)
