@@ -21,12 +21,14 @@ def soft_start(train: Objective, model: Model, offered: Collection[Unit]) -> Poi
 
     Nothing where it has none. Of effects on commands only: dry friction has a slope.
     """
-    bends = [shift for shift in shifts_of(train, offered) if shift.least > 0.0]
-    instead = {
-        unit: next((shift.unit for shift in bends if is_corner(unit, shift)), None)
-        for unit in model.units
-        if isinstance(unit.effect, ActionEffect)
-    }
+    sharp, laws = (
+        [unit for unit in units if isinstance(unit.effect, ActionEffect)]
+        for units in (model.units, offered)
+    )
+    if not sharp:
+        return None
+    bends = [shift for shift in shifts_of(train, laws) if shift.least > 0.0]
+    instead = {u: next((s.unit for s in bends if is_corner(u, s)), None) for u in sharp}
     if not any(instead.values()):
         return None
     strengths: dict[Unit, float] = {}
