@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchrl_bayessim.effects.catalogue import CATALOGUE, effect
-from torchrl_bayessim.effects.effect import ActionEffect, SensorEffect
+from torchrl_bayessim.effects.effect import ActionEffect, Reach, SensorEffect
 from torchrl_bayessim.effects.fields import ModelFields
 from torchrl_bayessim.effects.forcing import Forcing
 from torchrl_bayessim.effects.history import advanced, delayed, empty_line, read_line
@@ -119,6 +119,18 @@ def test_two_filters_in_a_row_are_one_after_the_other(name):
     assert changed(name, 0.2, 0, 1, 3, 2, second=0.25) == pytest.approx(once)
     nearly = changed(name, 0.2, 0, 1, 3, 2, second=1e-3)
     assert nearly == pytest.approx(changed(name, 0.2, 0, 1, 3, 2), abs=1e-3)
+
+
+def test_the_second_filter_of_a_sensor_is_moved_by_what_shows_between_readings():
+    """A twentieth of 0.2 s is over before the next reading, 0.1 s later; equal ones are a law."""
+    one, equal = effect("sensor_lag").forms(5.0)
+    assert (one.second, equal.second) == (0.0, 0.5)
+    width, least, most = one.free(Reach(1.0, 1.0, 5.0, slides=False))["second"]
+    assert (least, most) == (0.0, 0.5)
+    plain = changed("sensor_lag", 0.2, 0, 1, 3, 2)
+    assert changed("sensor_lag", 0.2, 0, 1, 3, 2, second=0.05) == pytest.approx(plain, abs=0.01)
+    moved = np.subtract(changed("sensor_lag", 0.2, 0, 1, 3, 2, second=width), plain)
+    assert np.abs(moved).max() > 0.05
 
 
 def test_what_two_filters_show_is_undone_twice():

@@ -22,7 +22,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from .effect import Memory, Now, Reach, SensorEffect
+from .effect import Effect, Memory, Now, Reach, SensorEffect
 from .history import advanced, delayed, empty_line, filled, read_line
 from .laws import SECOND_LAG, decay, quantized, within
 from .robot import Robot
@@ -159,10 +159,19 @@ class SensorLag(SensorEffect):
     def __init__(self, second: float = 0.0) -> None:
         self.second = second
 
+    def forms(self, seconds: float) -> tuple[Effect, ...]:
+        """Return one filter, and two that are equal."""
+        del seconds
+        return SensorLag(), SensorLag(SECOND_LAG["second"][-1])
+
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
-        """Return the share of the second filter."""
+        """Return the share of the second filter.
+
+        By a large change: what is far below the time between readings changes none of them.
+        """
         del reach
-        return SECOND_LAG
+        _, least, most = SECOND_LAG["second"]
+        return {"second": ((most - least) / 2, least, most)}
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.1 s."""
