@@ -27,6 +27,7 @@ from .validation import NEGLIGIBLE
 _WORTH = 0.01  # of the gap on test runs, to name chance beside another cause
 _CERTAIN = 100.0  # deviance on training and validation runs, to be named for less
 _REST = 0.25  # of what effects leave
+_LEFT, _MOST_OF_IT = 1.5, 0.5  # of the noise, what bridges leave; what is no stopgap takes of that
 
 
 @dataclass(frozen=True)
@@ -125,19 +126,33 @@ def _matters(scatter: Scatter, before: Shrinkage, after: Shrinkage) -> bool:
 def _with_holds(found: Found, scatter: Scatter) -> Found:
     """Return the same with samples that were not renewed, of the gap as it was recorded.
 
-    What explains next to nothing of that is a stopgap for what bridges leave.
+    What is a stopgap for what bridges leave is no cause.
     """
     measured, before = scatter.with_holds(found.measured), found.measured
     gap = max(measured.refit - 1.0, 1e-9)
     if measured.refit - before.refit <= _WORTH * gap:
         return found
-    if before.refit - before.effects <= _WORTH * gap:
+    if _is_stopgap(before, gap):
         found = replace(found, effects=(), strengths={}, confused=())
     smaller = max(before.refit - 1.0, 0.0) / gap
     lasting = [replace(e, share_of_gap=smaller * e.share_of_gap) for e in found.effects]
     (held,) = scatter.held_findings(measured, sum(e.share_of_gap for e in lasting))
     known = {**found.strengths, SensorDropout(): dict(held.strengths)}
     return _ranked(found, measured, [*lasting, held], known)
+
+
+def _is_stopgap(bridged: Shrinkage, gap: float) -> bool:
+    """Return whether effects explain next to nothing, but for what bridges leave.
+
+    Where that is much, and effects explain most of it, they are causes of their own.
+
+    Args:
+        bridged: How far the gap shrinks of samples with bridges in the places of those held.
+        gap: As it was recorded.
+    """
+    explained, left = bridged.refit - bridged.effects, bridged.refit - 1.0
+    much = bridged.refit > _LEFT and explained > _MOST_OF_IT * left
+    return explained <= _WORTH * gap and not much
 
 
 def _with_arrivals(found: Found, scatter: Scatter, sent: Sent, robot: Robot) -> Found:
