@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from apparatus import driven
-from rotor_and_link import gap, one_body, spring, two_bodies
+from rotor_and_link import LINK, ROTOR, gap, one_body, spring, two_bodies
 
 from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.effects.forcing import Forcing, Readings
@@ -53,12 +53,12 @@ def rigid(dt):
     return driven_by(one_body(dt), round(CONTROL / dt))
 
 
-def share_left(real, law, strength, dt):
+def share_left(real, law, strength, dt, *, finest=2e-4):
     """Return what of the difference that it stands for an effect misses, mean squares.
 
     Both are differences to a rigid shaft, with the same integrator each.
     """
-    difference = real - rigid(2e-4)
+    difference = real - rigid(finest)
     missed = simulated(law, strength, dt) - rigid(dt) - difference
     return np.mean(missed**2) / np.mean(difference**2)
 
@@ -76,6 +76,43 @@ def test_a_spring_is_that_of_a_rotor_and_a_load(hertz, dt):
 def test_a_gap_is_that_of_a_free_rotor(width, dt):
     shaft, _ = gap(width)
     assert share_left(truth(shaft), effect("backlash", rotor=True), width, dt) < 0.2
+
+
+def with_play(width, compliance, dt=2e-5):
+    """Return the joint's positions where a spring is at the sides of a gap between two bodies."""
+    model = two_bodies("", dt)
+    data, found = mujoco.MjData(model), []
+    reduced = ROTOR * LINK / (ROTOR + LINK)
+    c = 2 * 0.3 * np.sqrt(reduced / compliance)
+    for u in commands():
+        data.ctrl[0] = u
+        for _ in range(round(CONTROL / dt)):
+            apart, speed = data.qpos[1] - data.qpos[0], data.qvel[1] - data.qvel[0]
+            over = apart - np.clip(apart, -width / 2, width / 2)
+            force = (over / compliance + c * speed) if over else 0.0
+            data.qfrc_applied[:] = force, -force
+            mujoco.mj_step(model, data)
+        found.append(data.qpos[0])
+    return np.array(found)
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.005])
+@pytest.mark.parametrize(("width", "wind"), [(0.02, 0.3), (0.02, 1.5), (0.1, 0.05)])
+def test_a_gap_with_a_spring_is_that_of_a_rotor_and_a_load(width, wind, dt):
+    real = with_play(width, wind * width / 4.0)  # of 2 N m at a gear of 2
+    missed, stiff = (
+        share_left(real, effect("backlash", rotor=True, wind=w), width, dt, finest=2e-5)
+        for w in (wind, 0.0)
+    )
+    assert missed < 0.15
+    assert missed < 0.85 * stiff
+
+
+def test_a_gap_with_a_spring_is_nothing_where_there_is_no_gap():
+    law = effect("backlash", rotor=True, wind=1.0)
+    np.testing.assert_allclose(simulated(law, 0.0, 0.005), rigid(0.005), atol=1e-12)
+    nearly = simulated(law, 1e-7, 0.005) - rigid(0.005)
+    assert np.abs(nearly).max() < 1e-3
 
 
 def test_only_motors_with_a_rotor_have_one_in_a_gap():
@@ -169,6 +206,8 @@ def test_a_rotor_that_is_most_of_the_inertia_is_none_to_these_laws():
         ("series_elasticity", {"damping": 1.0}, ValueError, "below 1, got 1.0"),
         ("series_elasticity", {"damping": -0.1}, ValueError, "at least 0"),
         ("backlash", {"rotor": "no"}, TypeError, "expected rotor to be true or false"),
+        ("backlash", {"rotor": True, "wind": -1.0}, ValueError, "at least 0"),
+        ("backlash", {"wind": 1.0}, ValueError, "a rotor that winds a shaft up"),
     ],
 )
 def test_impossible_options_are_refused(name, options, error, match):

@@ -19,6 +19,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from ..errors import message
 from ..kinds import check_kind
 from ..scalars import check_number
 from .effect import Effect, Memory, Now, Reach
@@ -26,6 +27,10 @@ from .history import filled
 from .robot import Robot
 from .transmission import TransmissionEffect, at_actuators, change, servos
 
+_DAMPED = 0.3  # of the critical damping: what a shaft and its teeth have
+_TURN, _PARTS = 2.0, 16  # parts per radian of its own motion, at most
+_WINDS = 0.05, 20.0  # widths of the gap: stops nearly dead, and nearly no gap
+_SOFT = 3.0  # the same; what is stiffer is found from there
 _ROBOTS = 16  # whose inertias are kept: laws ask at every time step
 
 
@@ -40,18 +45,40 @@ class Backlash(TransmissionEffect):
         rotor: Whether the motor's rotor is free in the gap instead, ``I β̈ = F − I a J / M``, and
             stops dead at a side, where the joint gets its momentum: ``F − I Δβ̇ / Δt`` passes. Only
             motors with an armature have that; others are rigid.
+        wind: By how many widths of the gap the motor's largest force winds the shaft up, with a
+            free rotor: it meets a spring ``k = F_max / (wind · s)`` at the sides, with 0.3 of the
+            critical damping, ``I ẍ = F − I a J / M − (k (|x| − s/2) + c ẋ) J / M`` where
+            ``|x| > s/2`` (Nordin & Gutman, Automatica 38, 2002, section 2). A diagnosis fits it.
+
+    Raises:
+        TypeError: ``rotor`` is not a bool, or ``wind`` no number.
+        ValueError: ``wind`` is negative, or there is one without a free rotor.
     """
 
     name, unit, group = "backlash", "rad", "elasticity"
 
-    def __init__(self, *, rotor: bool = False) -> None:
+    def __init__(self, *, rotor: bool = False, wind: float = 0.0) -> None:
         check_kind("rotor to be true or false", rotor, bool)
-        self.rotor = rotor
+        check_number("wind, in widths of the gap", wind, least=0.0)
+        if wind and not rotor:
+            expected = "a rotor that winds a shaft up (a gap that a force leads has no spring)"
+            raise ValueError(message(expected, f"rotor=False, wind={wind}", hint="rotor=True"))
+        self.rotor, self.wind = rotor, wind
+
+    @property
+    def nuisances(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """How far a shaft that has a spring is wound up: no value is the usual one."""
+        return ("wind",) if self.wind else ()
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the wind-up of a shaft that has a spring."""
+        del reach
+        return {"wind": (0.1 * self.wind, *_WINDS)} if self.wind else {}
 
     def forms(self, seconds: float) -> tuple[Effect, ...]:
-        """Return both laws."""
+        """Return the law of a force that leads, and those of a rotor, on a stiff or soft shaft."""
         del seconds
-        return Backlash(), Backlash(rotor=True)
+        return Backlash(), Backlash(rotor=True), Backlash(rotor=True, wind=_SOFT)
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the actuators' names, for a rotor those that have some armature."""
@@ -82,7 +109,10 @@ class Backlash(TransmissionEffect):
         if not self.rotor:
             passed, gap = _led(half, gap, now)
             return change(passed, now), {"gap": gap}
-        passed, gap, speed = _free(half, gap, memory, now)
+        if self.wind:
+            passed, gap, speed = _sprung(half, gap, memory, now, wind=self.wind)
+        else:
+            passed, gap, speed = _free(half, gap, memory, now)
         return _handed_on(passed, now), {"gap": gap, "speed": speed, **_seen(passed, now)}
 
 
@@ -106,6 +136,42 @@ def _free(half: Tensor, gap: Tensor, memory: Memory, now: Now) -> tuple[Tensor, 
     after = torch.where((there.abs() < half) & (rotor > 0), memory["speed"] + gain, 0.0)
     taken = inertia * (after - memory["speed"]) / now.timestep
     return now.actuator_force - taken, there.clamp(-half, half), after
+
+
+def _sprung(
+    half: Tensor, gap: Tensor, memory: Memory, now: Now, *, wind: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the same where a spring is at the sides: exact in the gap, and exact beyond it."""
+    largest, _, gear = now.robot.actuator_limits
+    rotor = _rotors(now.robot).to(gap)
+    inertia = torch.where(rotor > 0, rotor, 1.0) / gear
+    push = (now.actuator_force - _lag(memory, now)) / inertia
+    there = (half > 0) & (rotor > 0)
+    give = 2 * wind * torch.where(there, half, 1.0) / (largest * gear.abs())
+    omega = 1 / (give * torch.where(rotor > 0, _reduced(now.robot).to(gap), 1.0)).sqrt()
+    parts = _parts(omega.amax(), now.timestep)
+    dt = now.timestep / parts
+    rings = omega * math.sqrt(1 - _DAMPED**2)
+    left = torch.exp(-_DAMPED * omega * dt)
+    cosine, sine = left * (rings * dt).cos(), left * (rings * dt).sin() / rings
+    wound, speed = push / omega**2, memory["speed"]
+    gap = torch.where(memory["gap"].isnan(), gap + wound, gap)  # of the first force at rest
+    for _ in range(parts):
+        side = gap.clamp(-half, half) + wound  # where the spring would come to rest
+        off, slope = gap - side, speed + _DAMPED * omega * (gap - side)
+        touches = gap.abs() > half
+        freely = gap + dt * (speed + dt * push / 2), speed + dt * push
+        rate = cosine * slope - sine * rings**2 * off
+        held = side + cosine * off + sine * slope
+        gap = torch.where(touches, held, freely[0])
+        speed = torch.where(touches, rate - _DAMPED * omega * (held - side), freely[1])
+    gap, speed = torch.where(there, gap, 0.0), torch.where(there, speed, 0.0)
+    return now.actuator_force - inertia * (speed - memory["speed"]) / now.timestep, gap, speed
+
+
+def _parts(omega: Tensor, timestep: float) -> int:
+    """Return into how many parts to cut a time step, so that a side is not met much too late."""
+    return int(torch.ceil(_TURN * omega * timestep).clamp(1, _PARTS))
 
 
 class SeriesElasticity(TransmissionEffect):

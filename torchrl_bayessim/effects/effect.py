@@ -109,7 +109,7 @@ class Effect(ABC):
     limit: ClassVar[bool] = False
     search_power: ClassVar[float] = 1.0
     graded: ClassVar[bool] = True
-    nuisances: ClassVar[tuple[str, ...]] = ()
+    nuisances: tuple[str, ...] = ()
     placed: ClassVar[tuple[str, ...]] = ()
 
     def __eq__(self, other: object) -> bool:
