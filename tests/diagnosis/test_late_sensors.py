@@ -30,6 +30,15 @@ def test_an_error_as_large_as_it_was_so_many_steps_before_is_not_explained(steps
     assert _no_more(GROWING, after, np.array(steps), CHECKED) == free
 
 
+@pytest.mark.parametrize(("left", "free"), [(1.0, False), (1.2985, True)])
+def test_a_sensor_that_is_hardly_late_has_little_for_nothing_although_noise_is_left(left, free):
+    """A twentieth of a step before, an error of 1.3 was 1.29; what is explained is a quarter."""
+    before = np.repeat(np.linspace(1.0, 1.6, len(CHECKED))[:, None], 2, axis=1)
+    after = before.copy()
+    after[:, 0] = np.linspace(1.0, 2 * left - 1.0, len(CHECKED))
+    assert _no_more(before, after, np.array([0.05, 0.0]), CHECKED) == free
+
+
 @pytest.mark.parametrize("horizon", [1, 3])
 def test_over_few_steps_no_gap_is_that_of_sensors_that_show_what_was_before(horizon):
     damped = logs(push=lambda q, v: -1.5 * np.sin(9 * q) * v)

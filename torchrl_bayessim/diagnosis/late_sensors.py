@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 LATE = SensorDelay.name, SensorLag.name
 _PREDICTED = 0.5  # of the rows that are compared: how many at least are predictions
 _MORE = 0.5  # of the error that it has for nothing: what it may leave
+_FURTHER = 2.0  # times what it explains for nothing, where noise is most of the error
 
 
 def free_riders(
@@ -92,13 +93,13 @@ def _no_more(before: Array, after: Array, steps: Array, checked: NDArray[np.int6
     """
     rows, least = np.r_[0, checked], np.minimum(1.0, before[0])
     late = np.flatnonzero(steps > 0)
-    left = free = predicted = 0.0
+    left = free = predicted = now = 0.0
     for c in late:
         part = np.clip(checked - steps[c], 0.0, 1.0)  # of what is shown, the rest was measured
         earlier = np.interp(checked - steps[c], rows, np.r_[least[c], before[:, c]])
         left += float(part @ after[:, c])
         free += float(part @ earlier)
+        now += float(part @ before[:, c])
         predicted += float(part.sum())
-    return bool(len(late)) and (
-        left >= _MORE * free or predicted < _PREDICTED * len(late) * len(checked)
-    )
+    no_better = left >= _MORE * free and now - left < _FURTHER * (now - free)
+    return bool(len(late)) and (no_better or predicted < _PREDICTED * len(late) * len(checked))
