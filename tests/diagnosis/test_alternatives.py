@@ -1,9 +1,13 @@
 """What is tried in the place of an effect."""
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 from plain_models import Unit, plain
 
 from torchrl_bayessim.diagnosis import alternatives
+from torchrl_bayessim.diagnosis.objective import Objective, Point
 
 GAIN, PAYLOAD, DRAG, OFFSET = (Unit(name) for name in ("gain", "payload", "drag", "offset"))
 
@@ -105,3 +109,25 @@ def test_laws_with_a_corner_are_softened_where_much_is_left(monkeypatch, left, c
     sets = "train", "validation"
     found = alternatives._in_their_forms(sets, best, known, [], start=start)
     assert found == [near] * count
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_what_imitates_a_lone_effect_beside_other_parameters_is_fitted_in_its_place(
+    monkeypatch, alone
+):
+    raced = []
+    for name in ("_as_before", "_bent", "_of_one_law", "_sliding", "_sticking", "_in_their_forms"):
+        monkeypatch.setattr(alternatives, name, lambda *_, **__: [])
+    monkeypatch.setattr(alternatives, "_raced", lambda _, starts, __: raced.extend(starts) or [])
+    monkeypatch.setattr(alternatives, "judged_fits", lambda *_: [plain({}, 900.0)])
+    screen = SimpleNamespace(best=lambda _: {})
+    monkeypatch.setattr(alternatives, "compare", lambda *_: SimpleNamespace(seen=screen))
+    monkeypatch.setattr(
+        alternatives, "imitators", lambda *_, most: [Point(np.zeros(1), {PAYLOAD: 0.1})]
+    )
+    best = plain([GAIN] if alone else [GAIN, OFFSET], 320.0)
+    alternatives.alternatives(
+        SimpleNamespace(width=Objective.width), "validation", best,
+        units=[], tried=[plain({}, 900.0)], first=screen, offered=[],
+    )  # fmt: skip
+    assert [list(start.strengths) for start in raced] == [[PAYLOAD]] * alone

@@ -21,6 +21,7 @@ from ..effects.transmission import ServoDeadBand
 from .explanations import compare
 from .form_fit import softened, with_fitted_forms, with_forms_anew
 from .free_numbers import bendable, fitted_numbers, priced
+from .imitators import imitators
 from .model import (
     LIKELY,
     Model,
@@ -88,7 +89,10 @@ def alternatives(
         for unit, (_, strength) in strongest.items():
             if len(additions) < most:
                 additions.setdefault(unit.effect, {unit: strength})
-        known += _raced((train, validation), _with_each(base, additions.values()), best)
+        starts = _with_each(base, additions.values())
+        if not kept:
+            starts += imitators(start, best, first, most=_ALIKE)
+        known += _raced((train, validation), starts, best)
         known += _as_before((train, validation), best, name, tried)
         known += _bent((train, validation), best, known, offered)
         known += _of_one_law((train, validation), best, kept, offered)
