@@ -52,6 +52,7 @@ def test_a_delay_of_every_channel_is_late_commands_and_a_filter_is_late_by_its_m
     robot = system().robot
     objective = SimpleNamespace(predictor=SimpleNamespace(system=SimpleNamespace(robot=robot)))
     units = {str(u): u for u in units_of([SensorDelay(), SensorLag()], robot)}
+    units |= {f"two {u}": u for u in units_of([SensorLag(0.5)], robot)}
 
     def late(name, where, seconds):
         point = Point(np.zeros(1), {units[f"{name}[{where}]"]: seconds})
@@ -63,3 +64,6 @@ def test_a_delay_of_every_channel_is_late_commands_and_a_filter_is_late_by_its_m
     kept = np.exp(-1 / 3)
     mean = sum(k * (1 - kept) * kept**k for k in range(200))
     assert late("sensor_lag", first, 3 * dt) == pytest.approx([mean, 0.0])
+    kept = np.exp(-2 / 3)
+    mean = sum(k * (1 - kept) * kept**k for k in range(200))
+    assert late("two sensor_lag", first, 3 * dt) == pytest.approx([2 * mean, 0.0])

@@ -10,6 +10,7 @@ from apparatus import driven
 from rotor_and_link import LINK, ROTOR, gap, one_body, spring, two_bodies
 
 from torchrl_bayessim.effects.catalogue import effect
+from torchrl_bayessim.effects.effect import Reach
 from torchrl_bayessim.effects.forcing import Forcing, Readings
 from torchrl_bayessim.effects.robot import robot_of
 from torchrl_bayessim.envs.task import Task
@@ -108,11 +109,92 @@ def test_a_gap_with_a_spring_is_that_of_a_rotor_and_a_load(width, wind, dt):
     assert missed < 0.85 * stiff
 
 
-def test_a_gap_with_a_spring_is_nothing_where_there_is_no_gap():
+def geared(gear, armature=ROTOR):
+    """Return a robot with two motors of that gear, one without a rotor."""
+    xml = """<mujoco><option timestep="{dt}"/><worldbody>
+      <body><joint name="a" axis="0 1 0" armature="{armature}"/>
+        <inertial pos="0 0 -.1" mass="0.5" diaginertia=".02 .02 .02"/></body>
+      <body><joint name="b" axis="0 1 0"/>
+        <inertial pos="0 0 -.1" mass="0.5" diaginertia=".02 .02 .02"/></body></worldbody>
+    <actuator><motor joint="a" gear="{gear}" ctrlrange="-2 2"/>
+      <motor joint="b" ctrlrange="-2 2"/></actuator></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml.format(dt=0.01, armature=armature, gear=gear))
+    return robot_of(Task(model=model, frame_skip=1))
+
+
+def passed(law, strengths, commands, *, gear=1.0, timestep=0.01):
+    """Return the changes of commands, ``(T, B, 2)``, of joints that are held."""
+    robot = geared(gear)
+    forcing, active = Forcing(robot), [(law, torch.tensor(strengths).double())]
+    memory, found = None, []
+    for command in commands:
+        state = Readings(
+            qpos=torch.zeros(len(strengths), 2).double(),
+            qvel=torch.zeros(len(strengths), 2).double(),
+            ctrl=torch.full((len(strengths), 2), command).double(),
+            time=torch.zeros(len(strengths), 1).double(),
+        )
+        memory = forcing.start(active, state) if memory is None else memory
+        added, memory = forcing(active, memory, state, timestep=timestep)
+        found.append(added["ctrl"].numpy())
+    return np.array(found)
+
+
+@pytest.mark.parametrize("wind", [0.05, 0.3, 3.0])
+@pytest.mark.parametrize("timestep", [0.002, 0.01, 0.02])
+def test_a_rotor_comes_to_rest_at_a_side_however_stiff_the_shaft(wind, timestep):
+    """The joint is held, the command turns round once: afterwards all of it passes."""
+    widths = np.geomspace(1e-7, 0.1, 25)
+    law = effect("backlash", rotor=True, wind=wind)
+    commands = [1.0] * 5 + [-1.0] * 600
+    changes = passed(law, [[w, w] for w in widths], commands, timestep=timestep)[..., 0]
+    assert np.abs(changes[0]).max() < 1e-9  # wound up by the first command
+    assert np.abs(changes[5:]).max() > 0.1
+    assert np.abs(changes[-50:]).max() < 0.01
+
+
+def test_a_gap_with_a_spring_is_the_same_beside_stiffer_ones():
+    law = effect("backlash", rotor=True, wind=3.0)
+    commands = 1.5 * np.sin(0.4 * np.arange(80))
+    together = passed(law, [[0.05, 0.0], [1e-4, 0.0], [0.0, 0.0]], commands)
+    alone = passed(law, [[0.05, 0.0]], commands)
+    np.testing.assert_array_equal(together[:, :1], alone)
+    assert np.abs(alone).max() > 0.1
+    assert not together[:, 2].any()
+
+
+def test_a_gap_with_a_spring_is_of_a_shaft_that_gears_stiffen():
+    """At the joint: twice the gear is twice the torque, on a shaft that is twice as stiff."""
+    law, commands = effect("backlash", rotor=True, wind=1.0), np.sin(0.4 * np.arange(60))
+    plus, minus = (passed(law, [[0.02, 0.0]], sign * commands, gear=2 * sign) for sign in (1, -1))
+    np.testing.assert_allclose(plus, -minus, atol=1e-12)
+    single = passed(law, [[0.01, 0.0]], commands)
+    np.testing.assert_allclose(passed(law, [[0.02, 0.0]], commands, gear=2.0), single, atol=1e-9)
+
+
+def test_a_motor_without_a_rotor_has_no_spring_behind_a_gap():
     law = effect("backlash", rotor=True, wind=1.0)
+    assert not passed(law, [[0.02, 0.02]], np.sin(0.4 * np.arange(60)))[..., 1].any()
+
+
+@pytest.mark.parametrize("wind", [0.05, 1.0])
+def test_a_narrow_gap_with_a_spring_changes_as_little(wind):
+    law = effect("backlash", rotor=True, wind=wind)
     np.testing.assert_allclose(simulated(law, 0.0, 0.005), rigid(0.005), atol=1e-12)
-    nearly = simulated(law, 1e-7, 0.005) - rigid(0.005)
-    assert np.abs(nearly).max() < 1e-3
+    for width in (1e-3, 1e-4, 1e-5, 1e-6):
+        moved = np.abs(simulated(law, width, 0.005) - rigid(0.005)).max()
+        assert moved < 20 * (1 + wind) * width
+
+
+def test_how_far_a_shaft_winds_up_is_fitted_like_a_strength():
+    led, stiff, soft = effect("backlash").forms(5.0)
+    reach = Reach(1.0, 1.0, 5.0, slides=False)
+    assert (led.rotor, stiff.rotor, soft.rotor) == (False, True, True)
+    assert not led.free(reach)
+    assert not stiff.free(reach)
+    width, least, most = soft.free(reach)["wind"]
+    assert 0 < least < width < soft.wind < most
+    assert (led.nuisances, stiff.nuisances, soft.nuisances) == ((), (), ("wind",))
 
 
 def test_only_motors_with_a_rotor_have_one_in_a_gap():
@@ -207,6 +289,7 @@ def test_a_rotor_that_is_most_of_the_inertia_is_none_to_these_laws():
         ("series_elasticity", {"damping": -0.1}, ValueError, "at least 0"),
         ("backlash", {"rotor": "no"}, TypeError, "expected rotor to be true or false"),
         ("backlash", {"rotor": True, "wind": -1.0}, ValueError, "at least 0"),
+        ("sensor_lag", {"second": 0.6}, ValueError, "at most 0.5"),
         ("backlash", {"wind": 1.0}, ValueError, "a rotor that winds a shaft up"),
     ],
 )

@@ -75,8 +75,9 @@ def _steps(objective: Objective, point: Point) -> Array:
         if isinstance(effect, SensorDelay):
             steps += values[0] / robot.dt
         elif isinstance(effect, SensorLag):
-            kept = np.exp(-robot.dt / np.maximum(values[0], 1e-9))
-            steps += kept / (1 - kept)
+            for share in effect.shares:
+                kept = np.exp(-robot.dt / np.maximum(share * values[0], 1e-9))
+                steps += kept / (1 - kept)
     return steps
 
 

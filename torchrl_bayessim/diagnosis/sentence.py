@@ -24,6 +24,7 @@ _BENT = {
     "second": ", {:.0%} of it in a second filter",
     "presliding": ", after {:.2g} of presliding", "onset": ", beginning over a speed of {:.2g}",
     "aside": ", {:+.2g} of its distance beside the end",
+    "wind": ", wound up by {:.2g} of its width",
 }  # fmt: skip
 
 

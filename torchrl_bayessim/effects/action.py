@@ -27,7 +27,7 @@ from torch import Tensor
 
 from .effect import ActionEffect, Effect, Memory, Now, Reach
 from .history import delayed, empty_line, filled, read_line
-from .laws import SECOND_LAG, bent, decay, quantized, two_lags, within
+from .laws import SECOND_LAG, SECOND_LAG_OF_STEPS, bent, decay, quantized, two_lags, within
 from .robot import Robot
 from .transmission import ServoDeadBand, ServoGain, servos
 
@@ -122,7 +122,7 @@ class ActionLag(ActionEffect):
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
         """Return the share of the second filter."""
         del reach
-        return SECOND_LAG
+        return SECOND_LAG_OF_STEPS if self.held else SECOND_LAG
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.15 s."""

@@ -29,6 +29,7 @@ from .transmission import TransmissionEffect, at_actuators, change, servos
 
 _DAMPED = 0.3  # of the critical damping: what a shaft and its teeth have
 _TURN, _PARTS = 2.0, 16  # parts per radian of its own motion, at most
+_TOO_LATE = 1.02  # radians times that, in a part: where more parts would be needed
 _WINDS = 0.05, 20.0  # widths of the gap: stops nearly dead, and nearly no gap
 _SOFT = 3.0  # the same; what is stiffer is found from there
 _ROBOTS = 16  # whose inertias are kept: laws ask at every time step
@@ -141,7 +142,11 @@ def _free(half: Tensor, gap: Tensor, memory: Memory, now: Now) -> tuple[Tensor, 
 def _sprung(
     half: Tensor, gap: Tensor, memory: Memory, now: Now, *, wind: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the same where a spring is at the sides: exact in the gap, and exact beyond it."""
+    """Return the same where a spring is at the sides: exact in the gap, and exact beyond it.
+
+    A side is met between parts of a time step. Where the spring is so stiff that it would be wound
+    up by then, the rotor meets it at the side, or bounces would gain what they never had.
+    """
     largest, _, gear = now.robot.actuator_limits
     rotor = _rotors(now.robot).to(gap)
     inertia = torch.where(rotor > 0, rotor, 1.0) / gear
@@ -149,29 +154,28 @@ def _sprung(
     there = (half > 0) & (rotor > 0)
     give = 2 * wind * torch.where(there, half, 1.0) / (largest * gear.abs())
     omega = 1 / (give * torch.where(rotor > 0, _reduced(now.robot).to(gap), 1.0)).sqrt()
-    parts = _parts(omega.amax(), now.timestep)
+    # as many as its own motion needs, whatever is beside it
+    parts = (_TURN * omega * now.timestep).ceil().clamp(1, _PARTS)
     dt = now.timestep / parts
+    late = _TURN * omega * dt > _TOO_LATE
     rings = omega * math.sqrt(1 - _DAMPED**2)
     left = torch.exp(-_DAMPED * omega * dt)
     cosine, sine = left * (rings * dt).cos(), left * (rings * dt).sin() / rings
     wound, speed = push / omega**2, memory["speed"]
     gap = torch.where(memory["gap"].isnan(), gap + wound, gap)  # of the first force at rest
-    for _ in range(parts):
+    for part in range(int(parts.max())):
         side = gap.clamp(-half, half) + wound  # where the spring would come to rest
         off, slope = gap - side, speed + _DAMPED * omega * (gap - side)
-        touches = gap.abs() > half
-        freely = gap + dt * (speed + dt * push / 2), speed + dt * push
+        touches = (gap.abs() > half) | (late & (gap.abs() == half) & (gap * speed > 0))
         rate = cosine * slope - sine * rings**2 * off
         held = side + cosine * off + sine * slope
-        gap = torch.where(touches, held, freely[0])
-        speed = torch.where(touches, rate - _DAMPED * omega * (held - side), freely[1])
+        free = gap + dt * (speed + dt * push / 2)
+        free = torch.where(late, free.clamp(-half, half), free)
+        slower = torch.where(touches, rate - _DAMPED * omega * (held - side), speed + dt * push)
+        gap = torch.where(part < parts, torch.where(touches, held, free), gap)
+        speed = torch.where(part < parts, slower, speed)
     gap, speed = torch.where(there, gap, 0.0), torch.where(there, speed, 0.0)
     return now.actuator_force - inertia * (speed - memory["speed"]) / now.timestep, gap, speed
-
-
-def _parts(omega: Tensor, timestep: float) -> int:
-    """Return into how many parts to cut a time step, so that a side is not met much too late."""
-    return int(torch.ceil(_TURN * omega * timestep).clamp(1, _PARTS))
 
 
 class SeriesElasticity(TransmissionEffect):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["SECOND_LAG", "bent", "decay", "quantized", "two_lags", "within"]
+__all__ = ["SECOND_LAG", "SECOND_LAG_OF_STEPS", "bent", "decay", "quantized", "two_lags", "within"]
 
 from collections.abc import Mapping
 
@@ -11,6 +11,8 @@ from torch import Tensor
 
 # a share of the time constant, as `Effect.free` has it
 SECOND_LAG: Mapping[str, tuple[float, float, float]] = {"second": (0.02, 0.0, 0.5)}
+# of what is filtered once per control step: what is far below that changes nothing
+SECOND_LAG_OF_STEPS: Mapping[str, tuple[float, float, float]] = {"second": (0.25, 0.0, 0.5)}
 
 
 def within(scale: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:

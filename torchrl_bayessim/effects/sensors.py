@@ -22,9 +22,10 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from ..scalars import check_number
 from .effect import Effect, Memory, Now, Reach, SensorEffect
 from .history import advanced, delayed, empty_line, filled, read_line
-from .laws import SECOND_LAG, decay, quantized, within
+from .laws import SECOND_LAG, SECOND_LAG_OF_STEPS, decay, quantized, within
 from .robot import Robot
 
 _LONGEST = 8  # control steps that a delay line remembers
@@ -151,13 +152,24 @@ class SensorLag(SensorEffect):
     Of two such filters in a row the first has ``(1 − r) s`` and the second ``r s``.
 
     Args:
-        second: ``r``, 0 to 0.5; 0 for one filter. A diagnosis fits it.
+        second: ``r``, 0 to 0.5; 0 for one filter. A diagnosis tries one and two equal ones, and
+            fits it.
+
+    Raises:
+        TypeError: ``second`` is no number.
+        ValueError: ``second`` is not from 0 to 0.5.
     """
 
     name, unit, group = "sensor_lag", "s", "timing"
 
     def __init__(self, second: float = 0.0) -> None:
+        check_number("the second filter's share", second, least=0.0, most=0.5)
         self.second = second
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """Of the strength, that of each filter."""
+        return (1 - self.second, self.second) if self.second else (1.0,)
 
     def forms(self, seconds: float) -> tuple[Effect, ...]:
         """Return one filter, and two that are equal."""
@@ -165,13 +177,9 @@ class SensorLag(SensorEffect):
         return SensorLag(), SensorLag(SECOND_LAG["second"][-1])
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
-        """Return the share of the second filter.
-
-        By a large change: what is far below the time between readings changes none of them.
-        """
+        """Return the share of the second filter."""
         del reach
-        _, least, most = SECOND_LAG["second"]
-        return {"second": ((most - least) / 2, least, most)}
+        return SECOND_LAG_OF_STEPS
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.1 s."""
@@ -203,8 +211,7 @@ class SensorLag(SensorEffect):
 
     def _kept(self, strength: Tensor, now: Now) -> list[Tensor]:
         """Return what each filter keeps of its last value."""
-        shares = (1 - self.second, self.second) if self.second else (1.0,)
-        return [decay(now.robot.dt, share * strength) for share in shares]
+        return [decay(now.robot.dt, share * strength) for share in self.shares]
 
 
 def _filtered(value: Tensor, kept: Tensor, memory: Tensor) -> Tensor:
