@@ -7,8 +7,10 @@ from torchrl.envs import Compose, GymEnv, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.libs.dm_control import DMControlEnv
 
 from torchrl_bayessim.effects.catalogue import CATALOGUE, effect
+from torchrl_bayessim.effects.compliance import Backlash
 from torchrl_bayessim.effects.effect import ActionEffect, ForceEffect, ModelEffect, SensorEffect
 from torchrl_bayessim.effects.robot import Robot
+from torchrl_bayessim.effects.sensors import SensorLag
 from torchrl_bayessim.effects.sequence import command_sequence, measured_sequence
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.envs.task import Task
@@ -53,15 +55,27 @@ def run(env, sequence, key="observation"):
 
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_batched_and_gymnasium_simulators_agree_and_zero_is_exactly_off(name):
-    probe = ApplyEffect(name, 0.0)
-    env = single(probe)
+    simulators_agree(name, NAME)
+
+
+@pytest.mark.parametrize(
+    "law", [Backlash(rotor=True), Backlash(rotor=True, wind=3.0), SensorLag(0.5)], ids=repr
+)
+def test_simulators_agree_on_other_laws_of_a_robot_with_rotors(law):
+    simulators_agree(law, "HalfCheetah-v5")
+
+
+def simulators_agree(law, robot):
+    """Check that an effect does the same around one environment and in a batch, and off nothing."""
+    probe = ApplyEffect(law, 0.0)
+    env = single(probe, name=robot)
     high = probe.effect.bounds(probe.robot)[1]
     if isinstance(probe.effect, ForceEffect | ModelEffect):
         high = 0.5 * high
     probe.strength = high
     env.reset()
-    both = ApplyEffect(name, torch.stack([torch.zeros_like(high), high]))
-    batch, plain = batched(both), batched()
+    both = ApplyEffect(law, torch.stack([torch.zeros_like(high), high]))
+    batch, plain = batched(both, name=robot), batched(name=robot)
     batch.reset(), plain.reset()
     start(env, batch, 1)
     if isinstance(probe.effect, SensorEffect):
@@ -70,7 +84,7 @@ def test_batched_and_gymnasium_simulators_agree_and_zero_is_exactly_off(name):
     with_effect = run(batch, sequence)
     assert torch.equal(with_effect[0], run(plain, sequence)[0])
     assert not torch.equal(with_effect[0], with_effect[1])
-    if not probe.effect.random or "quantization" in name:
+    if not probe.effect.random or "quantization" in probe.effect.name:
         # observations are float32, and solvers start from other warm starts after a reset
         alone = run(env, sequence).float()
         torch.testing.assert_close(alone, with_effect[1], rtol=1e-4, atol=1e-4)
