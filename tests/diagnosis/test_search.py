@@ -73,3 +73,27 @@ def test_where_much_is_left_a_limit_is_led_to_and_what_is_alike_too(monkeypatch,
     found = search._explained(SimpleNamespace(base=plain([], 1e6).fit), lambda _: push)
     assert found is (soft if led else push)
     assert given == ([push, bias] if led else [])
+
+
+@pytest.mark.parametrize(
+    ("names", "varied", "goes_on"),
+    [([A], True, "known"), ([A], False, "known"), ([], True, "found"), ([], False, "nothing")],
+    ids=["an effect beside what varies", "an effect", "what varies alone", "noise alone"],
+)
+def test_beside_what_varies_the_search_goes_on_though_nothing_else_was_known(
+    monkeypatch, names, varied, goes_on
+):
+    """A gap in a drive, beside jitter that was all that had been found."""
+    known, found, asked = plain(names, 440.0), plain([C], 400.0), []
+    robot = SimpleNamespace(predictor=SimpleNamespace(system=SimpleNamespace(robot=None)))
+    monkeypatch.setattr(searching, "compare", lambda *_: SimpleNamespace(seen=None))
+    monkeypatch.setattr(searching, "_p_value", lambda *_: 1e-9)
+    search = Scripted({}, {})
+    vars(search).update(
+        again=lambda: asked.append(1) or [known], varied=varied, units=[], screens=[], p_values=[],
+        tried=[], sets=(robot, None), alpha=0.01, generator=None, progress=lambda _: None,
+    )  # fmt: skip
+    search._explained = lambda *_: found
+    answers = {"known": known, "found": found, "nothing": None}
+    assert Search._further(search, search.start) is answers[goes_on]
+    assert asked == [1]

@@ -111,10 +111,13 @@ class Search:
         now = compare(train, best.fit, left)
         self.screens.append(now.seen)
         self.p_values.append(_p_value(now.seen, best, self.generator))
-        if self.again is not None and not best.units:
+        if self.again is not None and not best.units and len(self.screens) == 1:
             models = self.again()
             self.tried = [self.start, *models]
-            return models[0]
+            if models[0].units:
+                return models[0]
+            if not self.varied:
+                return None  # with another noise, nothing is still nothing
         apart = not enough or stands_apart(best, now.seen, train.predictor.system.robot)
         if not apart and not self._little(best, now.seen):
             return None
