@@ -6,8 +6,8 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, GymEnv, ParallelEnv, SerialEnv, TransformedEnv, check_env_specs
 from torchrl.envs.libs.dm_control import DMControlEnv
 
+from torchrl_bayessim.effects.backlash import Backlash
 from torchrl_bayessim.effects.catalogue import CATALOGUE, effect
-from torchrl_bayessim.effects.compliance import Backlash
 from torchrl_bayessim.effects.effect import ActionEffect, ForceEffect, ModelEffect, SensorEffect
 from torchrl_bayessim.effects.robot import Robot
 from torchrl_bayessim.effects.sensors import SensorLag

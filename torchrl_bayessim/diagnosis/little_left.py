@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..effects.action import ActionDelay
-from ..effects.compliance import Backlash
+from ..effects.backlash import Backlash
 from ..effects.friction import QuadraticDrag
 from ..effects.joints import CoulombFriction, ParallelSpring, ViscousFriction
 from .choice import chosen

@@ -12,13 +12,14 @@ from ..errors import message
 from ..kinds import check_kind
 from . import (
     action,
+    backlash,
     bodies,
-    compliance,
     contacts,
     disturbance,
     friction,
     joints,
     sensors,
+    series_elasticity,
     transmission,
 )
 from .effect import Effect
@@ -38,7 +39,7 @@ CATALOGUE = MappingProxyType(
             action.PacketDrop,
             action.ActionJitter,
             action.ActionQuantization,
-            compliance.Backlash,
+            backlash.Backlash,
             joints.CoulombFriction,
             friction.StribeckFriction,
             joints.ViscousFriction,
@@ -46,7 +47,7 @@ CATALOGUE = MappingProxyType(
             friction.LoadDependentFriction,
             friction.DirectionalFriction,
             joints.ParallelSpring,
-            compliance.SeriesElasticity,
+            series_elasticity.SeriesElasticity,
             bodies.GravityTilt,
             disturbance.ConstantForce,
             disturbance.PeriodicDisturbance,
