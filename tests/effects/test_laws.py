@@ -133,6 +133,21 @@ def test_the_second_filter_of_a_sensor_is_moved_by_what_shows_between_readings()
         assert bool(np.abs(np.subtract(both, first)).max() > 0.05) == shows
 
 
+def test_the_second_filter_of_a_controller_is_moved_by_what_shows_between_commands():
+    """A drive's goes on between them, and shows a smaller change, too."""
+    widths = {}
+    for held in (True, False):
+        law = effect("action_lag", held=held)
+        widths[held], _, _ = law.free(Reach(1.0, 1.0, 5.0, slides=False))["second"]
+        both = changed("action_lag", 0.15, 0, 1, 3, 2, held=held, second=widths[held])
+        first = changed("action_lag", (1 - widths[held]) * 0.15, 0, 1, 3, 2, held=held)
+        assert np.abs(np.subtract(both, first)).max() > 0.02
+    assert widths[False] < widths[True]
+    both = changed("action_lag", 0.15, 0, 1, 3, 2, held=True, second=widths[False])
+    first = changed("action_lag", (1 - widths[False]) * 0.15, 0, 1, 3, 2, held=True)
+    assert np.abs(np.subtract(both, first)).max() < 1e-6
+
+
 def test_what_two_filters_show_is_undone_twice():
     true = torch.sin(0.1 * torch.arange(60, dtype=torch.float64))[:, None]
     law, strength = effect("sensor_lag", second=0.3), torch.tensor([0.1]).double()

@@ -38,9 +38,9 @@ class Backlash(TransmissionEffect):
             stops dead at a side, where the joint gets its momentum: ``F − I Δβ̇ / Δt`` passes. Only
             motors with an armature have that; others are rigid.
         wind: By how many widths of the gap the motor's largest force winds the shaft up, with a
-            free rotor: it meets a spring ``k = F_max / (wind · s)`` at the sides, with 0.3 of the
-            critical damping, ``I ẍ = F − I a J / M − (k (|x| − s/2) + c ẋ) J / M`` where
-            ``|x| > s/2`` (Nordin & Gutman, Automatica 38, 2002, section 2). A diagnosis fits it.
+            free rotor: it meets a spring ``k = F_max / (wind · s)`` at the sides ``±s/2``, with
+            0.3 of the critical damping, ``I ẍ = F − I a J / M − (k (x ∓ s/2) + c ẋ) J / M``
+            beyond them (Nordin & Gutman, Automatica 38, 2002, section 2). A diagnosis fits it.
 
     Raises:
         TypeError: ``rotor`` is not a bool, or ``wind`` no number.
