@@ -39,7 +39,8 @@ def test_what_parameters_make_up_for_is_no_difference(every, tilt, alike):
     seen = SimpleNamespace(
         units=(GAIN, DRAG, PAYLOAD, DRAG),
         strengths=np.array([0.1, 0.4, 0.4, 0.1]),
-        changes=[does[part], -does[part], (does + tilt * other)[part], other[part]],
+        changes=[does[part], -does[part], (does + tilt * other)[part], other],
+        growth=np.array([*[np.sqrt(every)] * 3, 1.0]),
     )
     found = imitators(start, best, seen, most=3)
     assert [list(point.strengths) for point in found] == [[PAYLOAD]] * alike
@@ -51,8 +52,8 @@ def test_what_parameters_make_up_for_is_no_difference(every, tilt, alike):
 
 
 def test_nothing_is_alike_where_nothing_was_compared():
-    start = model_of([], np.ones((SEGMENTS, WIDTH)), np.zeros((SEGMENTS * WIDTH, 0)), np.zeros(0))
-    nothing = SimpleNamespace(units=(), strengths=np.zeros(0), changes=[])
+    start = model_of([], np.ones((SEGMENTS, WIDTH)), np.ones((SEGMENTS * WIDTH, 1)), np.zeros(1))
+    nothing = SimpleNamespace(units=(), strengths=np.zeros(0), changes=[], growth=np.zeros(0))
     assert not imitators(start, start, nothing, most=3)
 
 

@@ -35,15 +35,12 @@ def imitators(start: Model, best: Model, first: Screen, *, most: int) -> list[Po
         first: All units, compared with the parameters alone.
         most: How many effects, the most alike first.
     """
-    seen = {len(change) for change in first.changes}
-    if not seen:
-        return []
-    # all were compared on some of the segments, few on all
-    part = start.fit.spread(round(len(start.fit.innovations) / min(seen)))
+    # all were compared on every so many of the segments, few on all
+    part = start.fit.spread(round(float(first.growth.max(initial=1.0)) ** 2))
     before, size = start.fit.take(part), len(start.fit.point.z)
     change = (best.fit.innovations[part] - before.innovations).ravel()
     jacobian = before.jacobian[:, :size]
-    basis = np.linalg.qr(jacobian)[0] if jacobian.shape[1] else np.zeros((len(change), 0))
+    basis = np.linalg.qr(jacobian)[0]
     wanted = change - basis @ (basis.T @ change)
     alike: list[tuple[float, Unit, float, Array]] = []
     for unit, strength, changed in zip(first.units, first.strengths, first.changes, strict=True):
@@ -53,7 +50,7 @@ def imitators(start: Model, best: Model, first: Screen, *, most: int) -> list[Po
         other: Array = (changed[part] if whole else changed).ravel().astype(np.float64)
         own = other - basis @ (basis.T @ other)
         norm, product = float(own @ own), float(own @ wanted)
-        if len(other) == len(change) and norm > _ALONE * float(other @ other) and product > 0:
+        if norm > _ALONE * float(other @ other) and product > 0:
             cosine = product**2 / (norm * float(wanted @ wanted))
             amplitude = product / norm
             alike.append((cosine, unit, amplitude * float(strength), amplitude * other))
