@@ -12,7 +12,7 @@ __all__ = ["Predictor", "fewest_parts"]
 
 import copy
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import mujoco
@@ -29,6 +29,7 @@ from ..effects.effect import (
 )
 from ..effects.fields import ModelFields
 from ..effects.forcing import Forcing
+from ..envs.bias_forces import BeforeStep, BiasForces
 from ..envs.held_command import HeldCommand
 from ..envs.model_batch import ModelBatch
 from ..envs.stepper import Stepper
@@ -111,6 +112,7 @@ class Predictor:
             for name in ("dof_frictionloss", "dof_damping")
         }
         self._stepper = Stepper(model, 1, drive=task.drive, threads=self._threads)
+        self._bias = BiasForces(self._stepper, threads=self._threads)
 
     @property
     def colliding(self) -> bool:
@@ -292,9 +294,8 @@ class Predictor:
             ctrl = torch.from_numpy(kept.controls(commands[:, t]))
             for left in reversed(range(parts)):
                 state = {n: torch.from_numpy(stepper[n][rows]) for n in ("qpos", "qvel", "time")}
-                added, memories = self._forcing(
-                    active, memories, Readings(**state, ctrl=ctrl), timestep=held
-                )
+                now = BeforeStep(partial(self._bias, rows), **state, ctrl=ctrl)
+                added, memories = self._forcing(active, memories, now, timestep=held)
                 for name, at in self._entries.items():
                     if name in added:
                         models.table[np.ix_(rows, at)] = nominal[name] + added[name].numpy()
@@ -303,15 +304,15 @@ class Predictor:
                 command[rows, 0] = kept.again(commands[:, t])
                 if "ctrl" in added:
                     command[rows, 0, : ctrl.shape[1]] += added["ctrl"].numpy()
-                now = rows[alive]
+                going = rows[alive]
                 stepper.rollout(
                     command,
                     substeps=self.substeps // parts,
-                    rows=now,
+                    rows=going,
                     outputs=stepper.outputs,
                     ends=not left,
                 )
-                alive[alive] = stepper.status[now] == 0
+                alive[alive] = stepper.status[going] == 0
             simulated[rows[alive], t] = stepper.outputs[rows[alive], 0]
 
     def _place_welds(self) -> None:
@@ -336,6 +337,8 @@ class Predictor:
         def measured(k: int) -> Readings:
             values = {"qpos": segments.qpos, "qvel": segments.qvel, "ctrl": segments.ctrl}
             values["time"] = segments.time[..., None]
+            # what depends on it remembers nothing
+            values["qfrc_bias"] = np.zeros_like(segments.qvel)
             tiled = {n: np.tile(v[:, k], (count, 1)) for n, v in values.items()}
             return Readings(**{n: torch.from_numpy(v) for n, v in tiled.items()})
 

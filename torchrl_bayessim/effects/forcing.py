@@ -81,7 +81,8 @@ class Forcing:
             active: Effects and their strengths, shape ``(*batch, N)``. A change of commands is
                 seen by the effects that follow.
             memories: As returned by `start` or the last call.
-            state: ``qpos``, ``qvel``, ``time`` and ``ctrl``, shape ``(*batch, size)``.
+            state: ``qpos``, ``qvel``, ``time`` and ``ctrl``, shape ``(*batch, size)``; and
+                ``qfrc_bias`` where a law looks at it.
             timestep: Seconds until the next call; default the model's time step.
 
         Returns:
@@ -117,6 +118,8 @@ class Forcing:
             actuator_gain=self._actuators.gain,
             actuators=self._actuators,
             noise=None,
+            state=state,
+            dofs=self._dofs,
         )
 
 
@@ -140,6 +143,10 @@ class _TimeStep(SimpleNamespace):
     @cached_property
     def demanded_force(self) -> Tensor:
         return self.actuators.demanded(self.command, self.position, self.actuator_velocity)
+
+    @cached_property
+    def bias(self) -> Tensor:
+        return self.state.qfrc_bias[..., self.dofs]
 
     @cached_property
     def load(self) -> Tensor:

@@ -142,24 +142,45 @@ class QuadraticDrag(ForceEffect):
 
 
 class LoadDependentFriction(ForceEffect):
-    """Dry friction in proportion to the actuators' force: ``s |F|``; a fraction, 0 to 0.4."""
+    """Dry friction in proportion to a joint's load: ``s |F|``; a fraction, 0 to 0.4.
+
+    The load is the actuators' force; or, as in Duclusaud et al. (2024), that minus the force from
+    outside: ``F = τ_motor + τ_bias``, with ``τ_bias`` what holds a robot against gravity, Coriolis
+    and centrifugal forces (``qfrc_bias``). At joints without an actuator the load is the latter.
+
+    Args:
+        external: Whether the load counts forces from outside where there is an actuator, too.
+    """
 
     name, unit, group = "load_dependent_friction", "fraction", "friction"
+
+    def __init__(self, *, external: bool = False) -> None:
+        self.external = external
+
+    def forms(self, seconds: float) -> tuple[Effect, ...]:
+        """Return friction under the actuators' force, and under that from outside, too."""
+        del seconds
+        return LoadDependentFriction(), LoadDependentFriction(external=True)
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the names of the joints, none if no actuator moves one."""
         return robot.joints if any(j >= 0 for j in robot.joint_of_actuator) else ()
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
-        """Return 0 and 0.4, or 0 for joints without an actuator."""
-        high = [0.4 * (j in robot.joint_of_actuator) for j in range(len(robot.joints))]
-        return torch.zeros(len(high)).double(), torch.tensor(high, dtype=torch.float64)
+        """Return 0 and 0.4, or 0 where nothing is joined: a base that moves freely."""
+        driven = torch.tensor([j in robot.joint_of_actuator for j in range(len(robot.joints))])
+        high = 0.4 * (driven | robot.passive).double()
+        return torch.zeros_like(high), high
 
     def forces(
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
         """Return the dry friction under this load."""
-        return {"frictionloss": strength * now.load.abs()}, memory
+        outside = now.robot.passive | self.external
+        load = now.load
+        if strength[..., outside].any():  # what is outside takes as long as a time step
+            load = load + torch.where(outside, now.bias, 0.0)
+        return {"frictionloss": strength * load.abs()}, memory
 
 
 class DirectionalFriction(ForceEffect):

@@ -80,6 +80,18 @@ class Robot:
         return self.model
 
     @cached_property
+    def passive(self) -> Tensor:
+        """Which joints of two moving bodies nothing drives, boolean, shape ``(J,)``.
+
+        Those of a base that moves freely join it to nothing, and mocap bodies may drag any.
+        """
+        model = self.require_model()
+        parents = model.body_parentid[model.dof_bodyid[list(self.dof_index)]]
+        undriven = [j not in self.joint_of_actuator for j in range(len(self.joints))]
+        moving = (model.body_weldid[parents] != 0) & (model.nmocap == 0)
+        return torch.from_numpy(moving) & torch.tensor(undriven)
+
+    @cached_property
     def actuator_limits(self) -> tuple[Tensor, Tensor, Tensor]:
         """The largest force, the no-load speed and the gear of each actuator, shape ``(A,)``.
 

@@ -1,9 +1,9 @@
 """Forces that a simulator lacks, added before every time step instead of every control step.
 
 An *addition* is a function of the states before a time step, tensors ``(*batch, size)``: ``qpos``,
-``qvel``, ``time`` and ``ctrl``. It returns what is added in that time step alone to ``ctrl`` (seen
-by the additions that follow), to ``qfrc_applied``, or to the model's ``dof_frictionloss`` and
-``dof_damping``; whatever else has set these stays in force underneath.
+``qvel``, ``time``, ``ctrl`` and ``qfrc_bias`` (`BeforeStep`). It returns what is added in that time
+step alone to ``ctrl`` (seen by the additions that follow), to ``qfrc_applied``, or to the model's
+``dof_frictionloss`` and ``dof_damping``; whatever else has set these stays in force underneath.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 __all__ = ["Addition", "rollout_with", "steps_with"]
 
 from collections.abc import Callable, Iterable, Mapping
-from types import SimpleNamespace
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -19,10 +19,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .bias_forces import BeforeStep, BiasForces, bias_force
 from .held_command import HeldCommand
 from .stepper import Stepper
 
-Addition = Callable[[SimpleNamespace], Mapping[str, Tensor]]
+Addition = Callable[[BeforeStep], Mapping[str, Tensor]]
 _FIELDS = "dof_frictionloss", "dof_damping"
 _Array = NDArray[np.float64]
 
@@ -44,7 +45,7 @@ def rollout_with(
     models, count, nu = stepper.models, stepper.models.model.nv, len(stepper.relative)
     base = {f: [models.read(f, (d,)) for d in range(count)] for f in _FIELDS}
     applied = stepper["qfrc_applied"].copy()
-    rows = np.arange(stepper.num_envs)
+    bias, rows = BiasForces(stepper), np.arange(stepper.num_envs)
     outputs = np.full((*commands.shape[:2], stepper.output_size), np.nan)
     after = np.empty((stepper.num_envs, 1, stepper.output_size))
     for t in range(commands.shape[1]):
@@ -53,7 +54,7 @@ def rollout_with(
         for left in reversed(range(substeps)):
             names = "qpos", "qvel", "time"
             state = {name: torch.from_numpy(stepper[name]) for name in names}
-            added = _total(additions, ctrl=control, **state)
+            added = _total(additions, BeforeStep(bias, ctrl=control, **state))
             stepper["qfrc_applied"][:] = applied + added.get("qfrc_applied", 0.0)
             for field in _FIELDS:
                 for d, value in enumerate(base[field] if field in added else ()):
@@ -81,7 +82,9 @@ def steps_with(
         for _ in range(count):
             state = {n: torch.from_numpy(getattr(data, n).copy()) for n in ("qpos", "qvel")}
             time = torch.tensor([data.time], dtype=torch.float64)
-            added = _total(additions, ctrl=torch.from_numpy(control), time=time, **state)
+            bias = partial(bias_force, model, data)
+            now = BeforeStep(bias, ctrl=torch.from_numpy(control), time=time, **state)
+            added = _total(additions, now)
             data.ctrl[:] = control + added.get("ctrl", 0.0)
             data.qfrc_applied[:] = applied + added.get("qfrc_applied", 0.0)
             for field in _FIELDS:
@@ -94,9 +97,8 @@ def steps_with(
             getattr(model, field)[:] = base[field]
 
 
-def _total(additions: Iterable[Addition], **state: Tensor) -> dict[str, _Array]:
+def _total(additions: Iterable[Addition], now: BeforeStep) -> dict[str, _Array]:
     """Return the sum of what all additions add."""
-    now = SimpleNamespace(**state)
     total: dict[str, _Array] = {}
     for addition in additions:
         for name, value in addition(now).items():

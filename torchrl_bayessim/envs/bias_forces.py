@@ -1,0 +1,78 @@
+"""Gravity, Coriolis and centrifugal forces of the states that simulations are in.
+
+After a time step MuJoCo's ``qfrc_bias`` is that of its beginning. What depends on the load of a
+joint wants that of the coming one, under the physics of its own simulation.
+"""
+
+from __future__ import annotations
+
+__all__ = ["BeforeStep", "BiasForces", "bias_force"]
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .stepper import Stepper
+from .task import Readings
+
+Array = NDArray[np.float64]
+
+
+class BeforeStep(Readings):
+    """What may be looked at before a time step: arrays by name, and ``qfrc_bias``.
+
+    Args:
+        bias: Returns ``qfrc_bias``, shape ``(*batch, nv)``; asked where something looks at it.
+        arrays: ``qpos``, ``qvel``, ``time`` and ``ctrl``, shape ``(*batch, size)``.
+    """
+
+    def __init__(self, bias: Callable[[], Tensor], **arrays: Tensor) -> None:
+        super().__init__(**arrays)
+        self._bias = bias
+
+    @property
+    def qfrc_bias(self) -> Tensor:
+        """Gravity, Coriolis and centrifugal forces, N m or N."""
+        if "bias" not in vars(self):
+            self.bias = self._bias()
+        return self.bias
+
+
+class BiasForces:
+    """Evaluates the states of a `Stepper`, which stay as they are.
+
+    Args:
+        stepper: The simulations, each with physics of its own.
+        threads: To evaluate with; default all cores that this process may use.
+    """
+
+    def __init__(self, stepper: Stepper, *, threads: int | None = None) -> None:
+        self._stepper, self._threads = stepper, threads
+        self._evaluated: Stepper | None = None
+
+    def __call__(self, rows: NDArray[np.int64] | None = None) -> Tensor:
+        """Return ``qfrc_bias`` of the simulations ``rows``, default all, shape ``(R, nv)``."""
+        stepper, models, count = self._stepper, self._stepper.models, self._stepper.num_envs
+        if self._evaluated is None:  # most never ask
+            outputs, threads = ("qfrc_bias",), self._threads
+            self._evaluated = Stepper(models.model, count, outputs=outputs, threads=threads)
+        other = self._evaluated
+        if other.num_envs != count:
+            other.resize(count)
+        if other.models is not models:
+            other.use(models)
+        other.state[:] = stepper.state[:, : other.state.shape[1]]
+        other.begin(rows)
+        bias = other.outputs[:, 0]
+        return torch.from_numpy(bias.copy() if rows is None else bias[rows])
+
+
+def bias_force(model: mujoco.MjModel, data: mujoco.MjData) -> Tensor:
+    """Return ``qfrc_bias`` of the state that one simulation is in, shape ``(nv,)``."""
+    mujoco.mj_fwdPosition(model, data)
+    mujoco.mj_fwdVelocity(model, data)
+    return torch.from_numpy(data.qfrc_bias.copy())
