@@ -24,6 +24,7 @@ from .report import Finding
 _EDGE = 0.98  # of the largest strength that is looked for
 _FEWEST = 2  # periods per turn
 _ANYTHING = -np.inf, np.inf
+_IMPLICIT = mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
 
 def doubts(effects: Sequence[Finding], units: Sequence[Unit], prepared: Prepared) -> list[str]:
@@ -121,12 +122,12 @@ def numerical(effects: Sequence[Finding], robot: Robot) -> list[str]:
     """Return an alarm if all that was found is what another integrator would add.
 
     With damping ``d`` and a time step ``h``, integrators that take damping implicitly move a joint
-    as if its inertia were larger by ``h d``, and explicit ones as if it were smaller.
+    as if its inertia were larger by ``h d``: it is what a simulator lacks that does not.
     """
     places = {name: i for i, name in enumerate(robot.joints)}
     if robot.model is None or not effects or {e.name for e in effects} != {Armature.name}:
         return []
-    most = float(robot.model.opt.timestep) * _dampings(robot, robot.model)
+    most = float(robot.model.opt.timestep) * _explicit_dampings(robot, robot.model)
     strengths = {place: s for effect in effects for place, s in effect.strengths.items()}
     if any(s > most[places[place]] for place, s in strengths.items() if place in places):
         return []
@@ -137,10 +138,16 @@ def numerical(effects: Sequence[Finding], robot: Robot) -> list[str]:
     ]
 
 
-def _dampings(robot: Robot, model: mujoco.MjModel) -> NDArray[np.float64]:
-    """Return the damping of each joint, that of its servos with it."""
+def _explicit_dampings(robot: Robot, model: mujoco.MjModel) -> NDArray[np.float64]:
+    """Return the damping of each joint, and of its servos, that is not taken implicitly."""
+    euler = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    euler &= not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     damping = model.dof_damping[list(robot.dof_index)].copy()
     servos = -servo_damping(robot).numpy() * model.actuator_gear[:, 0] ** 2
+    if model.opt.integrator in _IMPLICIT:
+        return np.zeros_like(damping)
+    if euler:  # of the joints alone
+        damping[:] = 0.0
     for joint, one in zip(robot.joint_of_actuator, servos, strict=True):
         damping[joint] += one if joint >= 0 else 0.0
     return damping
