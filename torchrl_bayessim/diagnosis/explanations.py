@@ -25,7 +25,7 @@ from .screening import Screen, screen
 
 _PROMISING = 24  # explanations that are fitted on some segments
 _SURVIVORS, _FINALISTS = 7, 4  # that are fitted on all segments, and to the end
-_MANY, _APART, _MATTER = 400, 4, 8  # units, targets of one effect, effects to look at singly
+_MANY, _APART, _MATTER = 500, 4, 8  # units, targets of one effect, effects to look at singly
 _FEW, _EVERY = 8, 4  # segments on which a round begins at least, and which share at least
 _BENT = 5.0  # mean squared innovation of a nominal fit that may have gone astray
 _PLAIN = 300.0  # misfit beyond noise with which a few segments tell explanations apart

@@ -69,7 +69,7 @@ def without_free_riders(objective: Objective, noise: Array, selection: Selection
 def _steps(objective: Objective, point: Point) -> Array:
     """Return by how many control steps each channel is late."""
     robot = objective.predictor.system.robot
-    strengths = with_late_commands(strengths_of([point], robot), len(robot.actuators))
+    strengths = with_late_commands(strengths_of([point], robot), robot)
     steps = np.zeros(len(robot.channels))
     for effect, values in strengths.items():
         if isinstance(effect, SensorDelay):

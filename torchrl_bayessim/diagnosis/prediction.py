@@ -163,7 +163,7 @@ class Predictor:
         Returns:
             Shape ``(P, S, K, C)``; NaN where a simulation diverged.
         """
-        strengths = with_late_commands(strengths or {}, len(self.system.robot.actuators))
+        strengths = with_late_commands(strengths or {}, self.system.robot)
         chunk = max(1, _ROWS // len(segments))
         parts = []
         for begin in range(0, len(theta), chunk):
@@ -184,7 +184,7 @@ class Predictor:
 
         Arguments are those of `residuals`.
         """
-        strengths = with_late_commands(strengths or {}, len(self.system.robot.actuators))
+        strengths = with_late_commands(strengths or {}, self.system.robot)
         restored = self.sensing.restored(segments, strengths, len(theta))
         simulated = self._simulate(segments, theta, strengths, restored=restored, offsets=offsets)
         nq = self.system.task.model.nq

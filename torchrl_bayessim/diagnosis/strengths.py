@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from ..effects.action import ActionDelay
 from ..effects.effect import Effect
+from ..effects.robot import Robot
 from ..effects.sensors import SensorDelay
 
 Strengths = Mapping[Effect, NDArray[np.float64]]
 """Strengths of the candidates, by effect: shape ``(P, N)`` for the effect's ``N`` targets."""
 
 
-def with_late_commands(strengths: Strengths, actuators: int) -> Strengths:
+def with_late_commands(strengths: Strengths, robot: Robot) -> Strengths:
     """Return the same with delays of all channels alike as delays of all commands.
 
     No log can tell the one from the other. But a record that is moved as a whole needs no
@@ -25,15 +26,16 @@ def with_late_commands(strengths: Strengths, actuators: int) -> Strengths:
 
     Example:
         >>> late = {SensorDelay(): np.array([[0.02, 0.02], [0.02, 0.0]])}
-        >>> {e.name: s.tolist() for e, s in with_late_commands(late, 1).items()}
+        >>> robot = Robot(dt=0.01, actuators=("motor",))
+        >>> {e.name: s.tolist() for e, s in with_late_commands(late, robot).items()}
         {'sensor_delay': [[0.0, 0.0], [0.02, 0.0]], 'action_delay': [[0.02], [0.0]]}
 
     Args:
         strengths: Of all effects.
-        actuators: Their number.
+        robot: Whose.
     """
-    sensors, commands = SensorDelay(), ActionDelay()
-    late = strengths.get(sensors)
+    sensors, commands = SensorDelay(), ActionDelay(inside=robot.fast).on(robot)
+    late, actuators = strengths.get(sensors), len(robot.actuators)
     if late is None or not actuators:
         return strengths
     alike = late[:, :1] * (late == late[:, :1]).all(1, keepdims=True)

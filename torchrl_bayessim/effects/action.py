@@ -25,9 +25,10 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from .drive_timing import DriveDelay, DriveLag
 from .effect import ActionEffect, Effect, Memory, Now, Reach
 from .history import delayed, empty_line, filled, read_line
-from .laws import SECOND_LAG, SECOND_LAG_OF_STEPS, bent, decay, quantized, two_lags, within
+from .laws import SECOND_LAG, SECOND_LAG_OF_STEPS, bent, decay, lagged, quantized, within
 from .robot import Robot
 from .transmission import ServoDeadBand, ServoGain, servos
 
@@ -41,10 +42,30 @@ class ActionDelay(ActionEffect):
 
     In seconds, 0 to 5 control steps or 0.1 s. From logs of commands and measurements alone it
     cannot be told from a delay of all sensors.
+
+    Args:
+        inside: Whether a command acts from a time within the control step on, and not as the mean
+            of two; see `DriveDelay`.
     """
 
     name, unit, group = "action_delay", "s", "timing"
     stage = 2
+
+    def __init__(self, *, inside: bool = False) -> None:
+        self.inside = inside
+
+    def forms(self, seconds: float) -> tuple[Effect, ...]:
+        """Return the mean of two commands, and the one from a time within the step on."""
+        del seconds
+        return ActionDelay(), ActionDelay(inside=True)
+
+    def on(self, robot: Robot) -> Effect:
+        """Return the delay at every time step, of a robot that moves on within the step."""
+        return DriveDelay() if self.inside and robot.fast else self
+
+    def targets(self, robot: Robot) -> tuple[str, ...]:
+        """Return the actuators' names, none if only a faster robot would tell the difference."""
+        return () if self.inside else super().targets(robot)
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 5 control steps, at most 0.1 s."""
@@ -124,6 +145,10 @@ class ActionLag(ActionEffect):
         del reach
         return SECOND_LAG_OF_STEPS if self.held else SECOND_LAG
 
+    def on(self, robot: Robot) -> Effect:
+        """Return a drive's lag at every time step, of a robot that moves on within the step."""
+        return self if self.held or not robot.fast else DriveLag(self.second)
+
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.15 s."""
         return within(torch.ones_like(robot.command_scale), 0.0, 0.15)
@@ -137,29 +162,18 @@ class ActionLag(ActionEffect):
         self, action: Tensor, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Tensor, Memory]:
         """Return what the drive has reached, or its mean over the step."""
-        if self.second:
-            return self._twice(action, strength, memory, now)
-        behind = filled(memory["last"], action) - action
-        left = decay(now.robot.dt, strength)
-        reached = action + left * behind
-        mean = reached if self.held else action + strength / now.robot.dt * (1 - left) * behind
-        return mean, {"last": reached}
-
-    def _twice(
-        self, action: Tensor, strength: Tensor, memory: Memory, now: Now
-    ) -> tuple[Tensor, Memory]:
-        """Return the same of two filters."""
-        before, behind = (filled(memory[name], action) - action for name in ("first", "last"))
-        times = (1 - self.second) * strength, self.second * strength
         dt = now.robot.dt
-        left, further, through = two_lags(dt, *times)
-        first = left * before
-        if self.held:  # the second is given what the first has reached
-            last = first + further * (behind - first)
-            return action + last, {"first": action + first, "last": action + last}
-        last = further * behind + through * before
-        late = (times[0] * (before - first) + times[1] * (behind - last)) / dt
-        return action + late, {"first": action + first, "last": action + last}
+        if not self.held:
+            return lagged(action, memory, dt=dt, time_constant=strength, second=self.second)
+        behind = filled(memory["last"], action) - action
+        if not self.second:
+            reached = action + decay(dt, strength) * behind
+            return reached, {"last": reached}
+        # the second is given what the first has reached
+        before = filled(memory["first"], action) - action
+        first = decay(dt, (1 - self.second) * strength) * before
+        last = first + decay(dt, self.second * strength) * (behind - first)
+        return action + last, {"first": action + first, "last": action + last}
 
 
 class DeadBand(ActionEffect):

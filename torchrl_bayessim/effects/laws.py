@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
-__all__ = ["SECOND_LAG", "SECOND_LAG_OF_STEPS", "bent", "decay", "quantized", "two_lags", "within"]
+__all__ = [
+    "SECOND_LAG",
+    "SECOND_LAG_OF_STEPS",
+    "bent",
+    "decay",
+    "lagged",
+    "quantized",
+    "two_lags",
+    "within",
+]
 
 from collections.abc import Mapping
 
 import torch
 from torch import Tensor
+
+from .effect import Memory
+from .history import filled
 
 # a share of the time constant, as `Effect.free` has it
 SECOND_LAG: Mapping[str, tuple[float, float, float]] = {"second": (0.02, 0.0, 0.5)}
@@ -44,6 +56,41 @@ def two_lags(dt: float, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, 
     # (1 - exp(-x)) / x, which loses nothing where lags are nearly equal
     share = torch.where(apart > 0, -torch.expm1(-apart) / torch.where(apart > 0, apart, 1.0), 1.0)
     return left, further, dt / some * left * share
+
+
+def lagged(
+    command: Tensor, memory: Memory, *, dt: float, time_constant: Tensor, second: float
+) -> tuple[Tensor, Memory]:
+    """Return the mean over ``dt`` of what follows a command with a lag, and where it has got to.
+
+    Of one filter ``u + (s/Δ) (1 − e^{−Δ/s}) (a − u)``; of two, see `two_lags`.
+
+    Args:
+        command: ``u``, shape ``(*batch, N)``.
+        memory: ``last``, ``a``, and of two filters ``first``; NaN before the first command.
+        dt: ``Δ``, s.
+        time_constant: ``s``, s, broadcast to the command's shape.
+        second: Share of a second filter; 0 for one.
+
+    Example:
+        >>> none = {"last": torch.full((1,), torch.nan)}
+        >>> lag = dict(dt=0.1, time_constant=torch.tensor([0.1]), second=0.0)
+        >>> mean, memory = lagged(torch.zeros(1), none, **lag)
+        >>> mean, memory = lagged(torch.ones(1), memory, **lag)
+        >>> round(mean.item(), 3), round(memory["last"].item(), 3)
+        (0.368, 0.632)
+    """
+    behind = filled(memory["last"], command) - command
+    if not second:
+        left = decay(dt, time_constant)
+        reached = command + left * behind
+        return command + time_constant / dt * (1 - left) * behind, {"last": reached}
+    before = filled(memory["first"], command) - command
+    times = (1 - second) * time_constant, second * time_constant
+    left, further, through = two_lags(dt, *times)
+    first, last = left * before, further * behind + through * before
+    late = (times[0] * (before - first) + times[1] * (behind - last)) / dt
+    return command + late, {"first": command + first, "last": command + last}
 
 
 def quantized(value: Tensor, step: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ from torch import Tensor
 from ..envs.task import Task
 from ..errors import message
 
+_FAST = 0.25  # of a velocity, that a control step changes
 _SLIDE = int(
     mujoco.mjtJoint.mjJNT_SLIDE
 )  # slides and hinges have one coordinate, the others several
@@ -78,6 +79,21 @@ class Robot:
         if self.model is None:
             raise ValueError(message("a robot with a MuJoCo model", "none", hint="robot_of(task)"))
         return self.model
+
+    @cached_property
+    def fast(self) -> bool:
+        """Whether damping changes a driven joint's velocity much within one control step.
+
+        At the model's initial position: ``Δ d_i (M⁻¹)_ii > 0.25`` for one of them.
+        """
+        driven = [self.dof_index[j] for j in self.joint_of_actuator if j >= 0]
+        if self.model is None or not driven:
+            return False
+        data, inertia = mujoco.MjData(self.model), np.zeros((self.model.nv, self.model.nv))
+        mujoco.mj_forward(self.model, data)
+        mujoco.mj_fullM(self.model, data, inertia)
+        rates = self.model.dof_damping * np.diag(np.linalg.inv(inertia))
+        return bool(self.dt * rates[driven].max() > _FAST)
 
     @cached_property
     def passive(self) -> Tensor:
