@@ -1,5 +1,6 @@
 """What makes a further effect more than a stopgap."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -46,6 +47,23 @@ def test_what_is_hardly_a_share_of_the_gap_is_named_if_one_effect_takes_all_of_i
 ):
     """Less than a hundredth, but five times the noise."""
     start, base, better = plain([], 1e6), plain(first, 2400.0), plain([*first, more], left)
+    assert identified(start, base, better, [better]) == added
+
+
+@pytest.mark.parametrize(
+    ("judging", "left", "added"), [(5, 760.0, True), (3, 760.0, False), (5, 880.0, False)]
+)
+def test_what_hardly_exceeds_noise_is_named_if_all_runs_together_show_one_effect(
+    judging, left, added
+):
+    """A third beyond the noise, all of which it explains; few runs judge it."""
+    start, base, better = (
+        replace(model, validation=model.validation[:judging])
+        for model in (
+            plain(units, deviance, width=20)
+            for units, deviance in (([], 1e4), ([A], 1040.0), ([A, C], left))
+        )
+    )
     assert identified(start, base, better, [better]) == added
 
 

@@ -95,7 +95,10 @@ def _matters(
     lone = before - after > _ALONE * next_best
     if removed < (_LONE if lone and count < 2 else rest):
         return False
-    just_this = gain(base, better) > _SURELY and removed > 1.0 - _NOTHING
+    sure = gain(base, better) > _SURELY or (
+        gain(base, better) > _SURELY / 2 and total_gain(base, better) > 2 * _SURELY
+    )
+    just_this = sure and removed > 1.0 - _NOTHING
     if _leaves_less(start, base, _REMAINS):
         # a simulator that integrates otherwise is late, too, by a part of its time step
         second = len({unit.name for unit in base.units if _does_something(unit, better)}) <= 1
