@@ -77,6 +77,8 @@ def test_what_acts_at_all_in_proportion_is_said_with_the_place_of_its_strength()
     [
         ({"hardening": 5.0}, "(2 ± 0.01 N m/rad, hardening by 5 x²)"),
         ({"hardening": 0.0}, "(2 ± 0.01 N m/rad)"),
+        ({"external": True}, "(2 ± 0.01 N m/rad, of the load with what acts from outside)"),
+        ({"external": False}, "(2 ± 0.01 N m/rad)"),
     ],
 )
 def test_a_law_that_bends_is_said_to(form, said):

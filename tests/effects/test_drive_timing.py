@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from torchrl_bayessim.effects.action import ActionDelay, ActionLag
+from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.effects.drive_timing import DriveDelay, DriveLag
 from torchrl_bayessim.effects.forcing import Forcing
 from torchrl_bayessim.effects.push import Push
@@ -71,7 +72,7 @@ def test_a_delay_hands_on_what_was_sent_so_long_ago(seconds):
 def test_a_lag_within_the_step_is_on_average_the_one_of_the_step(seconds, second):
     robot, commands = wheels(), sent()
     strength = torch.tensor([seconds, 0.0]).double()
-    inside = acting(DriveLag(second), strength, robot, commands)
+    inside = acting(DriveLag(second=second), strength, robot, commands)
     law = ActionLag(held=False, second=second)
     torch.testing.assert_close(inside.mean(1), command_sequence(law, commands, strength, robot))
     if not second:  # and goes towards the command within it; what has two may swing past
@@ -92,10 +93,12 @@ def test_a_delay_within_the_step_is_on_average_the_one_of_the_step(seconds):
 def test_only_a_robot_that_its_damping_stops_within_a_step_has_them():
     fast, slow = wheels(damping=0.6), wheels(damping=0.4)
     assert (fast.fast, slow.fast) == (True, False)  # 0.05 s · d / 0.1 kg m² above 0.25
-    assert ActionLag(held=False, second=0.2).on(fast) == DriveLag(0.2)
+    assert ActionLag(held=False, second=0.2).on(fast) == DriveLag(second=0.2)
     assert ActionDelay(inside=True).on(fast) == DriveDelay()
     for law in (ActionLag(), ActionDelay()):
         assert law.on(fast) is law
+    for law in (DriveLag(second=0.2), DriveDelay()):  # as a report has them, and makes them anew
+        assert effect(law.name, **law.form).on(fast) == law
     for law in (ActionLag(held=False), ActionDelay(inside=True)):
         assert law.on(slow) is law
     assert ActionDelay(inside=True).targets(slow) == ()

@@ -25,6 +25,7 @@ _BENT = {
     "presliding": ", after {:.2g} of presliding", "onset": ", beginning over a speed of {:.2g}",
     "aside": ", {:+.2g} of its distance beside the end",
     "wind": ", wound up by {:.2g} of its width",
+    "external": ", of the load with what acts from outside",
 }  # fmt: skip
 
 

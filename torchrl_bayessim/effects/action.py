@@ -147,7 +147,7 @@ class ActionLag(ActionEffect):
 
     def on(self, robot: Robot) -> Effect:
         """Return a drive's lag at every time step, of a robot that moves on within the step."""
-        return self if self.held or not robot.fast else DriveLag(self.second)
+        return self if self.held or not robot.fast else DriveLag(second=self.second)
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.15 s."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 __all__ = ["DriveDelay", "DriveLag"]
 
 from collections.abc import Mapping
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -45,13 +46,14 @@ class DriveLag(_OfDrives):
     step.
 
     Args:
+        held: As of `ActionLag`, whose form this is: not.
         second: Share of a second filter, 0 to 0.5. A diagnosis fits it.
     """
 
     name = "action_lag"
 
-    def __init__(self, second: float = 0.0) -> None:
-        self.second = second
+    def __init__(self, *, held: Literal[False] = False, second: float = 0.0) -> None:
+        self.held, self.second = held, second
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
         """Return the share of the second filter."""
@@ -85,9 +87,15 @@ class DriveDelay(_OfDrives):
 
     The command in force at the time ``t`` is the one that was sent at ``t − s``, and of a time step
     in which it changes the mean.
+
+    Args:
+        inside: As of `ActionDelay`, whose form this is: so it is.
     """
 
     name = "action_delay"
+
+    def __init__(self, *, inside: Literal[True] = True) -> None:
+        self.inside = inside
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 5 control steps, at most 0.1 s."""
