@@ -122,6 +122,17 @@ def test_several_effects_are_each_a_transform():
     assert losses == [[100.0] * 3, [1.0] * 3]
 
 
+def test_effects_on_forces_are_asked_in_their_stages_however_they_were_found():
+    name = "HalfCheetah-v5"  # which is fast: what is late acts within a control step
+    robot = robot_of(known_task(name))
+    late = [effect("action_lag", held=False), effect("action_delay", inside=True)]
+    found = [effect("load_dependent_friction"), *(one.on(robot) for one in late)]
+    strengths = {one: {one.targets(robot)[-1]: 0.02} for one in found}
+    env = report(strengths).apply(BatchedMujocoEnv(name, 1, threads=1))
+    names = ["action_delay", "action_lag", "load_dependent_friction"]
+    assert [t.effect.name for t in env.transform] == names
+
+
 def test_without_effects_only_the_parameters_are_left():
     clean = report({})
     env = make(clean, MujocoPhysics("body_mass[pole]"))

@@ -22,6 +22,7 @@ from torchrl_bayessim.effects.catalogue import effect as catalogued
 from torchrl_bayessim.effects.disturbance import Cogging
 from torchrl_bayessim.effects.robot import robot_of
 from torchrl_bayessim.envs.task import Task
+from torchrl_bayessim.envs.tasks.catalogue import known_task
 from torchrl_bayessim.inference.priors import BoxPrior
 from torchrl_bayessim.logs.system import System
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
@@ -189,6 +190,16 @@ def test_an_armature_that_an_integrator_adds_is_no_cause(found, damping, options
     )
     alarms = numerical([found], robot)
     assert any("no more than another integrator adds" in alarm for alarm in alarms) == artefact
+
+
+def test_where_actions_move_no_joint_that_is_known_no_armature_is_an_integrators():
+    robot = robot_of(known_task("FetchPush-v4"))
+    joint = robot.joints[0]
+    found = Finding(
+        name="armature", where=joint, strength=1e3, unit="kg m²", ci95=(900.0, 1100.0),
+        p_value=0.0, share_of_gap=1.0, strengths={joint: 1e3},
+    )  # fmt: skip
+    assert numerical([found], robot) == []
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,12 @@ from torchrl.envs import TransformedEnv
 from torchrl_bayessim.diagnosis.objective import units_of
 from torchrl_bayessim.diagnosis.prediction import Predictor
 from torchrl_bayessim.diagnosis.segments import cut
+from torchrl_bayessim.effects.action import ActionDelay, ActionGain, ActionLag, DeadBand
 from torchrl_bayessim.effects.catalogue import CATALOGUE, effect
-from torchrl_bayessim.effects.effect import SensorEffect
+from torchrl_bayessim.effects.effect import ActionEffect, SensorEffect
+from torchrl_bayessim.effects.friction import LoadDependentFriction
+from torchrl_bayessim.effects.sensors import SensorDelay
+from torchrl_bayessim.effects.transmission import TorqueSpeedLimit
 from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.envs.tasks.catalogue import known_task
@@ -47,12 +51,12 @@ def actions(task, count=STEPS):
     return spans * torch.sin(torch.tensor([9.0, 24.0, 16.0])[: len(spans)] * times + 0.3)
 
 
-def recorded(task, applied=None, start=None):
+def recorded(task, *applied, start=None):
     """Return what an environment does, as a log of measured positions and velocities."""
     env = BatchedMujocoEnv(task, 1, threads=1, dtype=torch.float64)
     base = env
-    if applied is not None:
-        env = TransformedEnv(env, ApplyEffect(*applied))
+    for one in applied:
+        env = TransformedEnv(env, ApplyEffect(*one), auto_unwrap=True)
     td = env.reset()
     model = task.model
     qpos = torch.from_numpy(model.qpos0.copy()) if start is None else start
@@ -108,6 +112,83 @@ def test_replay_does_what_the_transform_does(name):
     assert worst(arm(), log) > 1e-4
 
 
+def fast_arm(**options):
+    """Return an arm whose damping stops a joint within a control step."""
+    model = mujoco.MjModel.from_xml_string(ARM)
+    model.dof_damping[:] = 3.0
+    return Task(model=model, frame_skip=5, **options)
+
+
+WITHIN = {
+    "lag": (ActionLag(held=False, second=0.3), 0.03),
+    "delay": (ActionDelay(inside=True), 0.013),
+}
+
+
+def replayed(task, log, effects):
+    """Return the largest error of segments cut from the middle of a log, and without effects."""
+    predictor = Predictor(System(task=task), threads=1)
+    predictor.exactly()
+    segments = cut([log], 10, history=20, burn_in=len(log))
+    assert segments.start.min() > 0
+    robot, strengths = predictor.system.robot, {}
+    for one, strength in effects:
+        law = one.on(robot)
+        strengths[law] = np.full((1, len(law.targets(robot))), strength)
+    found = [
+        predictor.residuals(segments, np.zeros((1, 0)), some)
+        for some in (strengths, dict(reversed(strengths.items())), {})
+    ]
+    np.testing.assert_array_equal(found[0], found[1])  # in whatever order they are given
+    return np.abs(found[0]).max(), np.abs(found[2]).max()
+
+
+@pytest.mark.parametrize(
+    "others",
+    [
+        (),
+        ((ActionGain(), 0.4),),
+        ((DeadBand(), 0.3),),
+        ((ActionDelay(), 0.02),),
+        ((TorqueSpeedLimit(), 0.5),),
+        ((LoadDependentFriction(), 0.2),),
+        ((LoadDependentFriction(external=True), 0.2),),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("late", WITHIN)
+def test_what_is_late_within_a_step_starts_a_segment_with_what_reached_it(late, others):
+    """In the middle of a run, beside effects that change commands before it, or after."""
+    task = fast_arm()
+    robot = System(task=task).robot
+    assert robot.fast
+    effects = [WITHIN[late], *others]
+    commands = [e for e in effects if isinstance(e[0].on(robot), ActionEffect)]
+    forces = [e for e in effects if e not in commands]
+    # of several around an environment the last is the first that an action meets
+    log = recorded(task, *forces, *commands)
+    with_them, without = replayed(task, log, effects)
+    assert with_them < 2e-3
+    assert without > 0.02
+
+
+@pytest.mark.parametrize("late", WITHIN)
+def test_what_is_late_within_a_step_is_the_command_that_a_task_makes(late):
+    task = fast_arm(command=lambda action: 0.5 * action)
+    with_it, without = replayed(task, recorded(task, WITHIN[late]), [WITHIN[late]])
+    assert with_it < 2e-3
+    assert without > 0.02
+
+
+def test_sensors_that_are_all_late_are_commands_that_are_late_within_the_step():
+    task, lag = fast_arm(), WITHIN["lag"]
+    log = recorded(task, WITHIN["delay"], lag)
+    whole, without = replayed(task, log, [lag, (SensorDelay(), 0.013)])
+    # of the rows before a segment the filter is given the mean of what is late
+    assert whole < 5e-3
+    assert without > 0.1
+
+
 def test_what_one_candidate_has_the_next_has_not():
     predictor = Predictor(System(task=arm()), threads=1)
     segments, nothing = cut([recorded(arm())], 20, history=2), np.zeros((1, 0))
@@ -124,7 +205,7 @@ def test_replay_does_what_the_transform_does_on_hopper(name):
         f"{name}[{'actuator1' if 'action' in name else 'leg_joint'}]"
     ]
     start = torch.tensor([0.0, 1.25, 0.0, -0.1, -0.1, 0.1], dtype=torch.float64)
-    log = recorded(task, (unit.effect, {unit.where: 0.1 * unit.high}), start)
+    log = recorded(task, (unit.effect, {unit.where: 0.1 * unit.high}), start=start)
     assert worst(task, log, unit, 0.1 * unit.high) < 1e-4
 
 

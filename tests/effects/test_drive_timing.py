@@ -12,10 +12,11 @@ from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.effects.drive_timing import DriveDelay, DriveLag
 from torchrl_bayessim.effects.forcing import Forcing
 from torchrl_bayessim.effects.push import Push
-from torchrl_bayessim.effects.robot import robot_of
+from torchrl_bayessim.effects.robot import Robot, robot_of
 from torchrl_bayessim.effects.sequence import command_sequence
 from torchrl_bayessim.envs.task import Readings, Task
 from torchrl_bayessim.envs.tasks.catalogue import known_task
+from torchrl_bayessim.transforms.apply_effect import ApplyEffect
 
 STEP, PARTS = 0.05, 5  # of the control step, and how many time steps it has
 WHEELS = """<mujoco><option timestep="0.01" gravity="0 0 0" integrator="implicitfast"/><worldbody>
@@ -134,3 +135,42 @@ def test_a_wheel_ends_a_step_where_the_last_part_of_its_command_has_moved_it():
         risen = (1 - math.exp(-rate * t)) / damping
         lost = (math.exp(-t / lag) - math.exp(-rate * t)) / (0.1 * (rate - 1 / lag))
         assert speed == pytest.approx(risen - lost, rel=0.02)
+
+
+def test_what_is_looked_for_is_what_a_catalogue_offers():
+    robot = wheels()
+    offered = [law for name in ("action_lag", "action_delay") for law in effect(name).forms(1.0)]
+    assert [law.on(robot) for law in offered[1::2]] == [DriveLag(), DriveDelay()]
+    for law, most in ((DriveLag(), 0.15), (DriveDelay(), 0.1)):
+        low, high = law.bounds(robot)
+        assert (low.tolist(), high.tolist()) == ([0.0, 0.0], [most, most])
+        assert law.targets(robot) == robot.actuators
+        assert [law.joint(robot, i) for i in range(2)] == list(robot.joint_of_actuator)
+    assert list(DriveLag().free(None)) == ["second"]
+    long = acting(DriveDelay(), [5 * STEP, 0.0], robot, sent())  # beyond what is looked for
+    torch.testing.assert_close(long[5:, 0, 0], sent()[:-5, 0])
+
+
+def test_a_robot_without_a_model_or_joints_is_not_fast_and_has_no_load():
+    plain = Robot(
+        dt=0.01,
+        actuators=("m",),
+        command_scale=torch.ones(1).double(),
+        joints=("a",),
+        joint_of_actuator=(0,),
+    )
+    assert not plain.fast
+    assert ActionLag(held=False).on(plain) == ActionLag(held=False)
+    assert effect("load_dependent_friction").targets(plain) == ()
+    ball = "<body><joint type='ball'/><geom size='.1'/></body>"
+    ball = f"<mujoco><worldbody>{ball}</worldbody></mujoco>"
+    none = robot_of(Task(model=mujoco.MjModel.from_xml_string(ball), frame_skip=1))
+    assert not none.fast
+    assert none.passive.tolist() == []
+    assert [b.tolist() for b in effect("load_dependent_friction").bounds(none)] == [[], []]
+
+
+def test_a_transform_that_is_told_the_robot_knows_its_law_at_once():
+    robot = robot_of(known_task("HalfCheetah-v5"))
+    assert ApplyEffect(ActionDelay(inside=True), 0.02, robot=robot).effect == DriveDelay()
+    assert ApplyEffect(ActionLag(held=False), 0.02, robot=robot).targets == robot.actuators

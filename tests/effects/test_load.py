@@ -67,7 +67,9 @@ def test_joints_of_two_bodies_have_a_load_and_a_free_base_has_none(task, loaded)
         low, high = effect(NAME, external=external).bounds(robot)
         assert not low.any()
         names = [n for n, most in zip(robot.joints, high.tolist(), strict=True) if most == 0.4]
-        assert tuple(names) == loaded
+        # at a joint without an actuator both forms are the same, which is offered once
+        both = tuple(n for n in loaded if not (external and n == "hinge"))
+        assert tuple(names) == both
 
 
 @pytest.mark.parametrize(("external", "torque"), [(False, 9.81 / 0.8), (True, 9.81 * 1.2 / 0.8)])

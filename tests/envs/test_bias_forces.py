@@ -38,7 +38,7 @@ def moving():
 def test_each_simulation_has_the_forces_of_its_own_physics_and_state():
     stepper = moving()
     before, table = stepper.state.copy(), stepper.models.table.copy()
-    bias = BiasForces(stepper, threads=1)
+    bias = BiasForces(stepper)
     forces = bias()
     # m g l sin of the elbow's angle in the world, and m l · 0.5 ω² sin of the elbow's own
     for force, mass, q, v in zip(
@@ -53,7 +53,7 @@ def test_each_simulation_has_the_forces_of_its_own_physics_and_state():
 
 def test_they_follow_what_is_written_and_how_many_there_are():
     stepper = moving()
-    bias = BiasForces(stepper, threads=1)
+    bias = BiasForces(stepper)
     light = bias()
     stepper.models.write("opt.gravity", (2,), np.zeros(3))
     assert bias()[1].tolist() == [0.0, 0.0]  # it stands

@@ -19,19 +19,19 @@ Array = NDArray[np.float64]
 def commanded(
     robot: Robot, segments: Segments, strengths: Strengths, count: int, *, seed: int = 0
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Return the distinct command sequences, ``(B, H, A)``, and which each row follows.
+    """Return the distinct command sequences, ``(B, W, A)``, and which each row follows.
 
-    Random effects are drawn from ``seed``.
+    From the beginning of the windows to the end of the horizon. Random effects are drawn from
+    ``seed``.
     """
-    size, at = len(segments), segments.history
-    upto = at + segments.horizon
+    size, upto = len(segments), segments.history + segments.horizon
     window = torch.from_numpy(segments.ctrl[:, :upto])
     kinds = [(effect, strengths[effect]) for effect in in_stages(strengths)]
     changed = np.zeros(count, dtype=bool)
     for _, values in kinds:
         changed |= values.any(1)
     which = np.flatnonzero(changed)
-    plain = segments.ctrl[:, at:upto]
+    plain = segments.ctrl[:, :upto]
     number = np.zeros(count, dtype=np.int64)
     number[which] = 1 + np.arange(len(which))
     sequence = (number[:, None] * size + np.arange(size)).reshape(-1)
@@ -46,5 +46,5 @@ def commanded(
             current[torch.from_numpy(on)] = command_sequence(
                 effect, current[torch.from_numpy(on)], strength, robot, time=time, seed=seed
             )
-    distinct = np.concatenate([plain[None], current[:, :, at:].numpy()])
+    distinct = np.concatenate([plain[None], current.numpy()])
     return np.ascontiguousarray(distinct.reshape(-1, *plain.shape[1:])), sequence

@@ -148,6 +148,8 @@ def _explicit_dampings(robot: Robot, model: mujoco.MjModel) -> NDArray[np.float6
         return np.zeros_like(damping)
     if euler:  # of the joints alone
         damping[:] = 0.0
+    if len(servos) != len(robot.actuators):
+        return damping  # actions that a task makes commands of move no joint that is known
     for joint, one in zip(robot.joint_of_actuator, servos, strict=True):
         damping[joint] += one if joint >= 0 else 0.0
     return damping

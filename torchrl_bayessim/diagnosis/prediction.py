@@ -29,6 +29,7 @@ from ..effects.effect import (
 )
 from ..effects.fields import ModelFields
 from ..effects.forcing import Forcing
+from ..effects.sequence import forces_in_stages
 from ..envs.bias_forces import BeforeStep, BiasForces
 from ..envs.held_command import HeldCommand
 from ..envs.model_batch import ModelBatch
@@ -112,7 +113,7 @@ class Predictor:
             for name in ("dof_frictionloss", "dof_damping")
         }
         self._stepper = Stepper(model, 1, drive=task.drive, threads=self._threads)
-        self._bias = BiasForces(self._stepper, threads=self._threads)
+        self._bias = BiasForces(self._stepper)
 
     @property
     def colliding(self) -> bool:
@@ -207,13 +208,14 @@ class Predictor:
         offsets: Array | None = None,
     ) -> Array:
         """Return what follows from the start states, shape ``(P, S, H, outputs)``."""
-        count, size, horizon = len(theta), len(segments), segments.horizon
+        count, size, horizon, at = len(theta), len(segments), segments.horizon, segments.history
         actions, sequence = commanded(
             self.system.robot, segments, strengths, count, seed=self.realisation
         )
-        commands = self._converted(actions)
+        whole = self._converted(actions)
+        commands = np.ascontiguousarray(whole[:, at:])
         self._write(theta, strengths)
-        stepper, at = self._stepper, segments.history
+        stepper = self._stepper
         if stepper.num_envs != count * size:
             stepper.resize(count * size)
         stepper.use(self._models.repeated(size))
@@ -256,7 +258,7 @@ class Predictor:
                 segments,
                 some,
                 rows=pushed,
-                commands=commands[sequence[pushed]],
+                commands=whole[sequence[pushed]],
                 simulated=simulated,
             )
         return simulated.reshape(count, size, horizon, -1)
@@ -277,13 +279,17 @@ class Predictor:
         commands: Array,
         simulated: Array,
     ) -> None:
-        """Simulate ``rows`` with forces of their own, one time step after the other."""
+        """Simulate ``rows`` with forces of their own, one time step after the other.
+
+        Of commands there are those of the whole windows, up to the horizon.
+        """
         stepper, models = self._stepper, self._stepper.models
-        count = len(rows) // len(segments)
         active = [
-            (e, torch.from_numpy(np.repeat(s, len(segments), axis=0))) for e, s in strengths.items()
+            (e, torch.from_numpy(np.repeat(strengths[e], len(segments), axis=0)))
+            for e in forces_in_stages(strengths)
         ]
-        memories = self._warm(segments, active, count)
+        memories = self._warm(segments, active, commands)
+        commands = commands[:, segments.history :]
         nominal = {name: models.table[rows][:, at] for name, at in self._entries.items()}
         command = np.empty((stepper.num_envs, 1, commands.shape[2]))
         alive = np.ones(len(rows), dtype=bool)
@@ -330,16 +336,21 @@ class Predictor:
         stepper.state[:] = starts
 
     def _warm(
-        self, segments: Segments, active: Sequence[tuple[ForceEffect, Tensor]], count: int
+        self, segments: Segments, active: Sequence[tuple[ForceEffect, Tensor]], commands: Array
     ) -> list[Memory]:
-        """Run hidden states along the measured motion that leads to the start."""
+        """Run hidden states along the measured motion and commands that lead to the start."""
+        count = len(commands) // len(segments)
+        relative = self._stepper.relative
+        moved = np.flatnonzero(relative >= 0)
 
         def measured(k: int) -> Readings:
-            values = {"qpos": segments.qpos, "qvel": segments.qvel, "ctrl": segments.ctrl}
+            values = {"qpos": segments.qpos, "qvel": segments.qvel}
             values["time"] = segments.time[..., None]
             # what depends on it remembers nothing
             values["qfrc_bias"] = np.zeros_like(segments.qvel)
             tiled = {n: np.tile(v[:, k], (count, 1)) for n, v in values.items()}
+            tiled["ctrl"] = commands[:, k, : len(relative)].copy()
+            tiled["ctrl"][:, moved] += tiled["qpos"][:, relative[moved]]
             return Readings(**{n: torch.from_numpy(v) for n, v in tiled.items()})
 
         memories = self._forcing.start(active, measured(0))

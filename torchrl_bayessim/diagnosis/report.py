@@ -18,7 +18,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from ..effects.effect import Effect, SensorEffect
 from ..effects.robot import Robot
-from ..effects.sequence import in_stages
+from ..effects.sequence import forces_in_stages, in_stages
 from ..effects.units import unit_at
 from ..errors import message
 from ..inference.priors import BoxPrior
@@ -251,8 +251,9 @@ class Report:
             for e, s in strengths.items()
         }
         # the last of several transforms is the first that an action meets
-        last = in_stages(effects)[::-1]
-        chain: list[Any] = [effects[e] for e in (*last, *(e for e in effects if e not in last))]
+        last, first = in_stages(effects)[::-1], forces_in_stages(effects)
+        others = [e for e in effects if e not in last and e not in first]
+        chain: list[Any] = [effects[e] for e in (*last, *first, *others)]
         if physics is None:
             for effect in chain:
                 env = TransformedEnv(env, effect, auto_unwrap=True)

@@ -21,7 +21,7 @@ from .history import filled
 from .laws import SECOND_LAG, lagged, within
 from .robot import Robot
 
-_LONGEST = 6  # control steps that a delay line remembers
+_LONGEST = 8  # control steps that a delay line remembers
 _ROUNDING = 1e-6  # of a control step
 
 
@@ -29,6 +29,7 @@ class _OfDrives(ForceEffect):
     """What changes commands at every time step; targets are actuators."""
 
     unit, group, channel = "s", "timing", "actuation"
+    stage = 10  # a delay before it: what is late goes through the rest
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the actuators' names."""
@@ -93,6 +94,7 @@ class DriveDelay(_OfDrives):
     """
 
     name = "action_delay"
+    stage = 2
 
     def __init__(self, *, inside: Literal[True] = True) -> None:
         self.inside = inside

@@ -53,7 +53,7 @@ Now = SimpleNamespace
 ``robot``: the `Robot`; ``time``: seconds since the episode began, ``(*batch, 1)``; ``noise``:
 uniform numbers in [0, 1) of this control step, as many as there are targets, for random effects.
 For forces, in joint order: ``position`` and ``velocity`` ``(*batch, J)``, and ``load``, the
-generalised force that actuators exert ``(*batch, J)``, and ``bias``, what they exert against
+generalised force that actuators exert ``(*batch, J)``, and ``bias``, what holds them against
 gravity, Coriolis and centrifugal forces ``(*batch, J)``; in actuator order: ``command``,
 ``actuator_velocity``, ``actuator_force``, ``demanded_force``, which is the same without limits, and
 ``actuator_gain``, the force per unit of command ``(*batch, A)``; and ``timestep``, the seconds that
@@ -218,9 +218,14 @@ class ForceEffect(Effect):
     """Adds to forces, friction, damping or commands at every time step of a MuJoCo model.
 
     Targets are joints unless `targets` says otherwise.
+
+    Attributes:
+        stage: As of `ActionEffect`: of several, those of a lower stage are asked first, and what
+            they change of the commands is what the others see.
     """
 
     channel = "body"
+    stage: ClassVar[int] = 20
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the joints' names, none without a MuJoCo model."""

@@ -164,12 +164,17 @@ class LoadDependentFriction(ForceEffect):
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the names of the joints, none if no actuator moves one."""
-        return robot.joints if any(j >= 0 for j in robot.joint_of_actuator) else ()
+        moved = any(j >= 0 for j in robot.joint_of_actuator)
+        return super().targets(robot) if moved else ()
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
-        """Return 0 and 0.4, or 0 where nothing is joined: a base that moves freely."""
-        driven = torch.tensor([j in robot.joint_of_actuator for j in range(len(robot.joints))])
-        high = 0.4 * (driven | robot.passive).double()
+        """Return 0 and 0.4, or 0 where nothing is joined: a base that moves freely.
+
+        And at joints without an actuator if ``external``, where both are the same.
+        """
+        driven = [j in robot.joint_of_actuator for j in range(len(robot.joints))]
+        loaded = torch.tensor(driven, dtype=torch.bool)
+        high = 0.4 * (loaded if self.external else loaded | robot.passive).double()
         return torch.zeros_like(high), high
 
     def forces(

@@ -86,8 +86,10 @@ class Robot:
 
         At the model's initial position: ``Δ d_i (M⁻¹)_ii > 0.25`` for one of them.
         """
+        if self.model is None:
+            return False
         driven = [self.dof_index[j] for j in self.joint_of_actuator if j >= 0]
-        if self.model is None or not driven:
+        if not driven:
             return False
         data, inertia = mujoco.MjData(self.model), np.zeros((self.model.nv, self.model.nv))
         mujoco.mj_forward(self.model, data)
@@ -105,7 +107,7 @@ class Robot:
         parents = model.body_parentid[model.dof_bodyid[list(self.dof_index)]]
         undriven = [j not in self.joint_of_actuator for j in range(len(self.joints))]
         moving = (model.body_weldid[parents] != 0) & (model.nmocap == 0)
-        return torch.from_numpy(moving) & torch.tensor(undriven)
+        return torch.from_numpy(moving) & torch.tensor(undriven, dtype=torch.bool)
 
     @cached_property
     def actuator_limits(self) -> tuple[Tensor, Tensor, Tensor]:

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-__all__ = ["command_sequence", "in_stages", "measured_sequence", "restored_sequence"]
+__all__ = [
+    "command_sequence",
+    "forces_in_stages",
+    "in_stages",
+    "measured_sequence",
+    "restored_sequence",
+]
 
 from collections.abc import Iterable
 from types import SimpleNamespace
@@ -11,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ..randomness import generator
-from .effect import ActionEffect, Effect, Now, SensorEffect
+from .effect import ActionEffect, Effect, ForceEffect, Now, SensorEffect
 from .robot import Robot
 
 
@@ -26,6 +32,19 @@ def in_stages(effects: Iterable[Effect]) -> list[ActionEffect]:
     """
     kinds = [one for one in effects if isinstance(one, ActionEffect)]
     return sorted(kinds, key=lambda one: (one.stage, one.name))
+
+
+def forces_in_stages(effects: Iterable[Effect]) -> list[ForceEffect]:
+    """Return the effects on forces in the order in which they are asked (`ForceEffect.stage`).
+
+    Example:
+        >>> from torchrl_bayessim.effects.drive_timing import DriveDelay, DriveLag
+        >>> from torchrl_bayessim.effects.friction import QuadraticDrag
+        >>> [one.name for one in forces_in_stages([QuadraticDrag(), DriveLag(), DriveDelay()])]
+        ['action_delay', 'action_lag', 'quadratic_drag']
+    """
+    kinds = [one for one in effects if isinstance(one, ForceEffect)]
+    return sorted(kinds, key=lambda one: (one.stage, one.name, repr(one)))
 
 
 def command_sequence(

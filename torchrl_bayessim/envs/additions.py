@@ -29,7 +29,12 @@ _Array = NDArray[np.float64]
 
 
 def rollout_with(
-    stepper: Stepper, additions: Iterable[Addition], commands: _Array, *, substeps: int
+    stepper: Stepper,
+    additions: Iterable[Addition],
+    commands: _Array,
+    *,
+    substeps: int,
+    bias: BiasForces | None = None,
 ) -> _Array:
     """Apply sequences of commands, as `Stepper.rollout` does, with additions at every time step.
 
@@ -38,6 +43,7 @@ def rollout_with(
         additions: In their order.
         commands: Shape ``(N, T, C)``; what is added to them, to their controls.
         substeps: Time steps per command.
+        bias: Of the simulations, where they are stepped more than once; default its own.
 
     Returns:
         The outputs after each command, shape ``(N, T, M)``; NaN after a divergence.
@@ -45,7 +51,7 @@ def rollout_with(
     models, count, nu = stepper.models, stepper.models.model.nv, len(stepper.relative)
     base = {f: [models.read(f, (d,)) for d in range(count)] for f in _FIELDS}
     applied = stepper["qfrc_applied"].copy()
-    bias, rows = BiasForces(stepper), np.arange(stepper.num_envs)
+    bias, rows = bias or BiasForces(stepper), np.arange(stepper.num_envs)
     outputs = np.full((*commands.shape[:2], stepper.output_size), np.nan)
     after = np.empty((stepper.num_envs, 1, stepper.output_size))
     for t in range(commands.shape[1]):

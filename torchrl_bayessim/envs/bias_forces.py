@@ -46,25 +46,26 @@ class BiasForces:
     """Evaluates the states of a `Stepper`, which stay as they are.
 
     Args:
-        stepper: The simulations, each with physics of its own.
-        threads: To evaluate with; default all cores that this process may use.
+        stepper: The simulations.
     """
 
-    def __init__(self, stepper: Stepper, *, threads: int | None = None) -> None:
-        self._stepper, self._threads = stepper, threads
+    def __init__(self, stepper: Stepper) -> None:
+        self._stepper = stepper
         self._evaluated: Stepper | None = None
 
     def __call__(self, rows: NDArray[np.int64] | None = None) -> Tensor:
         """Return ``qfrc_bias`` of the simulations ``rows``, default all, shape ``(R, nv)``."""
-        stepper, models, count = self._stepper, self._stepper.models, self._stepper.num_envs
-        if self._evaluated is None:  # most never ask
-            outputs, threads = ("qfrc_bias",), self._threads
-            self._evaluated = Stepper(models.model, count, outputs=outputs, threads=threads)
-        other = self._evaluated
-        if other.num_envs != count:
-            other.resize(count)
-        if other.models is not models:
-            other.use(models)
+        stepper, other = self._stepper, self._evaluated
+        if other is None or other.num_envs != stepper.num_envs:  # most never ask
+            other = self._evaluated = Stepper(
+                stepper.models.model,
+                stepper.num_envs,
+                outputs=("qfrc_bias",),
+                sharing=stepper.sharing,
+                threads=stepper.threads,
+            )
+        if other.models is not stepper.models:
+            other.use(stepper.models)
         other.state[:] = stepper.state[:, : other.state.shape[1]]
         other.begin(rows)
         bias = other.outputs[:, 0]

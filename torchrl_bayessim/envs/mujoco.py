@@ -21,6 +21,7 @@ from torchrl.envs import EnvBase
 from ..errors import message
 from ..kinds import check_kind, real_numbers
 from .additions import Addition, rollout_with
+from .bias_forces import BiasForces
 from .components import check_counts, check_own, check_settings, chosen_rows, finite_rows
 from .draws import Draws
 from .model_batch import ModelBatch
@@ -86,6 +87,7 @@ class BatchedMujocoEnv(EnvBase):
             threads=threads,
         )
         self._additions: dict[object, Addition] = {}
+        self._bias = BiasForces(self.stepper)
         self._work: Callable[[], None] | None = None
         self._seed = 0 if seed is None else int(seed)
         self._episodes = np.zeros(num_envs, dtype=np.int64)
@@ -231,7 +233,9 @@ class BatchedMujocoEnv(EnvBase):
             )
         if self._work is not None:
             self._work()
-        added = rollout_with(self.stepper, self._additions.values(), commands, substeps=substeps)
+        added = rollout_with(
+            self.stepper, self._additions.values(), commands, substeps=substeps, bias=self._bias
+        )
         if outputs is not None:
             outputs[:] = added
         return added

@@ -69,6 +69,8 @@ class Stepper:
         initial: The model's initial state, shape ``(S,)``.
         status: What became of each simulation in the last call that included it: 0, or
             `native.DIVERGED`, ``OVERFLOW`` or ``FAILED`` (which are errors too), shape ``(N,)``.
+        threads: Threads to step with.
+        sharing: How many simulations share one physics.
         command_size: Numbers in a command.
         relative: Where in ``qpos`` is what each control is added to, -1 for none, shape ``(nu,)``.
         welded: Whether commands step a mocap body from the pose of the body that it drags.
@@ -96,17 +98,17 @@ class Stepper:
         outputs = names_of(outputs)
         sites = [name for name in outputs if name.startswith("site_velocity[")]
         arrays = tuple(name for name in outputs if name not in sites)
-        self._threads = threads or len(os.sched_getaffinity(0))
+        self.threads = threads or len(os.sched_getaffinity(0))
         self._hire = lambda: Worker(model, arrays)
         self._workers = [self._hire()]
-        self._pool = Threads(self._threads)
+        self._pool = Threads(self.threads)
         self._running: list[Future[float]] = []
         self._pace = 1e-5  # s per time step, as last seen
         self._queue = np.zeros(1, dtype=np.int64)
         self._drive = resolved(model, drive, sites)
         self._inside = resolved(model, replace(drive, pinned=(), contact_forces=False), sites)
         self.relative, self.welded = self._drive[0], drive.weld is not None
-        self._sharing = sharing
+        self.sharing = sharing
         self.command_size = model.nu + (0 if drive.weld is None else 7)
         self.layout = layout(self._workers[0].data, arrays + tuple(sites))
         self.output_size = sum(int(np.prod(shape)) for _, shape in self.layout.values())
@@ -115,15 +117,15 @@ class Stepper:
         size = mujoco.mj_stateSize(model, _SIGNATURE)
         data = mujoco.MjData(model)
         mujoco.mj_getState(model, data, self.initial[:size], _SIGNATURE)
-        self.models = ModelBatch(model, num_envs // sharing, threads=self._threads)
+        self.models = ModelBatch(model, num_envs // sharing, threads=self.threads)
         self.resize(num_envs)
 
     def resize(self, num_envs: int) -> None:
         """Change the number of simulations; all start anew, and new physics are nominal."""
         self.num_envs = num_envs
-        while len(self._workers) < min(self._threads, num_envs):
+        while len(self._workers) < min(self.threads, num_envs):
             self._workers.append(self._hire())
-        self.models.resize(num_envs // self._sharing)
+        self.models.resize(num_envs // self.sharing)
         self.state = np.tile(self.initial, (num_envs, 1))
         self.outputs = np.zeros((num_envs, 1, self.output_size))
         self.status = np.zeros(num_envs, dtype=np.int64)
@@ -131,8 +133,8 @@ class Stepper:
 
     def use(self, models: ModelBatch) -> None:
         """Step with these physics from now on, one row per ``sharing`` simulations."""
-        if models.num_envs * self._sharing != self.num_envs:
-            expected = f"the physics of {self.num_envs // self._sharing} environments"
+        if models.num_envs * self.sharing != self.num_envs:
+            expected = f"the physics of {self.num_envs // self.sharing} environments"
             raise ValueError(message(expected, models.num_envs))
         if not models.overrides(self.models):
             # what the former physics override stands in the models of the workers
@@ -241,7 +243,7 @@ class Stepper:
         """
         wait(self._running)  # after an interrupt
         self._queue[0] = 0
-        batch = self.models.table, self._sharing, self.state, _SIGNATURE
+        batch = self.models.table, self.sharing, self.state, _SIGNATURE
         shared = drive, self._queue, rows, outputs, self.status, *arguments
         most = max(1, int(steps * self._pace / _HANDING_OVER))
         calls = []

@@ -32,11 +32,13 @@ class ApplyEffect(Transform):
     """Lets an effect act: on actions, on what is observed, on forces or on the model.
 
     Effects on actions and observations act around any environment, those on forces at every time
-    step and those on the model at resets of a MuJoCo environment. Hidden state starts anew where
-    an environment resets. Beside an `ApplyPhysics`, put it after that: at a reset the parameters
-    are written first, and the effect changes what is then in force, never its own last change.
-    Effects on the model are written after the simulator's own reset, whose observation is the one
-    without them. Of several around one environment the last is the first that an action meets.
+    step (on a fast robot a drive's lag, and a delay within the control step) and those on the model
+    at resets of a MuJoCo environment. Hidden state starts anew where an environment resets. Beside
+    an `ApplyPhysics`, put it after that: at a reset the parameters are written first, and the
+    effect changes what is then in force, never its own last change. Effects on the model are
+    written after the simulator's own reset, whose observation is the one without them. Of several
+    around one environment the last is the first that an action meets, and of those on forces the
+    first is asked first.
 
     Args:
         effect: The effect, or its name in the catalogue.
@@ -86,6 +88,7 @@ class ApplyEffect(Transform):
         self._steps = torch.zeros(0)  # since the episode began, shape (*batch, 1)
         self._acting: Push | Overlay | None = None  # on the simulator
         if robot is not None:
+            self.effect = self.effect.on(robot)
             self.strength = strength
 
     @property
