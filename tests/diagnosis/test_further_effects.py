@@ -64,7 +64,10 @@ def test_what_hardly_exceeds_noise_is_named_if_all_runs_together_show_one_effect
             for units, deviance in (([], 1e4), ([A], 1040.0), ([A, C], left))
         )
     )
-    assert identified(start, base, better, [better]) == added
+    beside = {"seen": screened({})[0], "robot": None}
+    assert identified(start, base, better, [better], **beside) == added
+    # of a part of what was found at once no law has been bent yet
+    assert not identified(start, base, better, [better])
 
 
 @pytest.mark.parametrize(("units", "added"), [([Unit("drag")], True), ([A, Unit("drag")], False)])

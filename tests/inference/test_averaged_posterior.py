@@ -41,24 +41,37 @@ def test_networks_that_held_out_other_pairs_have_none_in_common():
     assert AveragedPosterior([MixtureDensityPosterior(PRIOR, 1)]).held_out is None
 
 
-def products(summary):
-    """Return answers to three trajectories: of each network, and together."""
+def products(summary, apart):
+    """Return answers to three trajectories: of each network, and together.
+
+    Of the first networks whose answers are ``apart``: how they come out depends on the processor.
+    """
     theta = torch.linspace(2, 6, 600)[:, None]
-    networks = [MixtureDensityPosterior(PRIOR, 1, components=4, seed=seed) for seed in (0, 1)]
     pairs = TensorDict({"theta": theta, "summary": summary(theta)}, [600])
-    fit_apart(networks, pairs, seeds=(0, 1), epochs=30, progress=False)
     several = summary(torch.tensor([[5.0], [5.02], [4.98]]))
-    each = [network.condition(several).mixture for network in networks]
-    return each, AveragedPosterior(networks).condition(several).mixture
+    for first in range(0, 20, 2):
+        seeds = first, first + 1
+        networks = [MixtureDensityPosterior(PRIOR, 1, components=4, seed=seed) for seed in seeds]
+        fit_apart(networks, pairs, seeds=seeds, epochs=30, progress=False)
+        each = [network.condition(several).mixture for network in networks]
+        if apart(*each):
+            return each, AveragedPosterior(networks).condition(several).mixture
+    pytest.fail("all networks answer alike")
+
+
+def mean(mixture):
+    return (mixture.logits.softmax(-1) @ mixture.loc).item()
+
+
+def on_the_right(mixture):
+    return (mixture.logits.softmax(-1) @ (mixture.loc > 0).to(mixture.loc)).item()
 
 
 def test_means_of_products_come_half_of_the_way_together():
-    each, together = products(lambda theta: theta)
+    each, together = products(lambda x: x, lambda a, b: abs(mean(b) - mean(a)) > 2e-4)
     (one, other), loc = each, together.loc
-    means = [(own.logits.softmax(-1) @ own.loc).item() for own in each]
     moved = loc - torch.cat([one.loc, other.loc])
-    way = (means[1] - means[0]) / 2
-    assert abs(way) > 1e-4
+    way = (mean(other) - mean(one)) / 2
     share = torch.cat([moved[: len(one.loc)] / way, moved[len(one.loc) :] / -way])
     assert (share > 0.4).all()
     assert (share <= 0.5 + 1e-6).all()
@@ -79,10 +92,11 @@ def test_products_that_lie_apart_along_a_ridge_stay_on_it():
 
 
 def test_modes_of_products_stay_where_they_are():
-    each, together = products(lambda theta: (theta - 4).abs())
+    # n answers choose a mode, and networks not the same one
+    each, together = products(
+        lambda theta: (theta - 4).abs(), lambda a, b: abs(on_the_right(a) - on_the_right(b)) > 0.8
+    )
     before = torch.cat([own.loc for own in each])
-    right = [(own.logits.softmax(-1) @ (own.loc > 0).to(own.loc)).item() for own in each]
-    assert abs(right[0] - right[1]) > 0.8  # n answers choose a mode, and networks not the same one
     moved = (together.loc - before).abs().flatten()
     assert (moved < 0.01 * together.scale_tril.flatten()).all()
 

@@ -183,6 +183,7 @@ class ServoDeadBand(_OfServos):
     """
 
     name, unit, group = "dead_band", "command", "dead zone"
+    stage = 18  # of the error, before the gain of the force that it makes
 
     def __init__(self, *, damped: bool = True) -> None:
         self.damped = damped
