@@ -25,20 +25,19 @@ def commanded(
     ``seed``.
     """
     size, upto = len(segments), segments.history + segments.horizon
-    window = torch.from_numpy(segments.ctrl[:, :upto])
+    plain = segments.ctrl[:, :upto]
     kinds = [(effect, strengths[effect]) for effect in in_stages(strengths)]
     changed = np.zeros(count, dtype=bool)
     for _, values in kinds:
         changed |= values.any(1)
     which = np.flatnonzero(changed)
-    plain = segments.ctrl[:, :upto]
     number = np.zeros(count, dtype=np.int64)
     number[which] = 1 + np.arange(len(which))
     sequence = (number[:, None] * size + np.arange(size)).reshape(-1)
     if not len(which):
         return np.ascontiguousarray(plain), sequence
     time = torch.from_numpy(segments.time[:, :upto])
-    current = window.expand(len(which), *window.shape).clone()
+    current = torch.from_numpy(plain).expand(len(which), *plain.shape).clone()
     for effect, values in kinds:
         on = values[which].any(1)
         if on.any():

@@ -140,14 +140,13 @@ def numerical(effects: Sequence[Finding], robot: Robot) -> list[str]:
 
 def _explicit_dampings(robot: Robot, model: mujoco.MjModel) -> NDArray[np.float64]:
     """Return the damping of each joint, and of its servos, that is not taken implicitly."""
-    euler = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
-    euler &= not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     damping = model.dof_damping[list(robot.dof_index)].copy()
-    servos = -servo_damping(robot).numpy() * model.actuator_gear[:, 0] ** 2
     if model.opt.integrator in _IMPLICIT:
         return np.zeros_like(damping)
-    if euler:  # of the joints alone
-        damping[:] = 0.0
+    euler = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    if euler and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
+        damping[:] = 0.0  # of the joints alone
+    servos = -servo_damping(robot).numpy() * model.actuator_gear[:, 0] ** 2
     if len(servos) != len(robot.actuators):
         return damping  # actions that a task makes commands of move no joint that is known
     for joint, one in zip(robot.joint_of_actuator, servos, strict=True):

@@ -9,6 +9,7 @@ from __future__ import annotations
 __all__ = ["BeforeStep", "BiasForces", "bias_force"]
 
 from collections.abc import Callable
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -34,12 +35,10 @@ class BeforeStep(Readings):
         super().__init__(**arrays)
         self._bias = bias
 
-    @property
+    @cached_property
     def qfrc_bias(self) -> Tensor:
         """Gravity, Coriolis and centrifugal forces, N m or N."""
-        if "bias" not in vars(self):
-            self.bias = self._bias()
-        return self.bias
+        return self._bias()
 
 
 class BiasForces:
