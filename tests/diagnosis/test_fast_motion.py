@@ -16,7 +16,9 @@ from torchrl_bayessim.diagnosis.fast_motion import FastMotion, fast_motion
 from torchrl_bayessim.diagnosis.modes import Mode
 from torchrl_bayessim.diagnosis.prediction import Predictor
 from torchrl_bayessim.diagnosis.preparation import prepare
+from torchrl_bayessim.diagnosis.segments import cut
 from torchrl_bayessim.diagnosis.velocity_errors import with_velocity_errors
+from torchrl_bayessim.diagnosis.whitening import start_noise
 from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.envs.tasks.catalogue import known_task
 from torchrl_bayessim.inference.priors import BoxPrior
@@ -157,3 +159,27 @@ def test_velocities_that_are_too_fast_are_estimated_before_anything_is_fitted():
     assert prepared.nominal.mean_square < 1.5
     fitted = prepared.sets["train"].theta(prepared.nominal.point.z[None])[0]
     np.testing.assert_allclose(fitted, TRUE, rtol=0.15)
+
+
+def test_velocities_know_nothing_of_the_rows_that_are_predicted_from_them(robot):
+    predictor, logs, _ = robot
+    motion, row = FastMotion(tuple(range(9)), 20.0, share=0.01), 20
+    later = torch.zeros_like(logs[0].qpos)
+    later[row + 1 :, 3:] = 0.1
+    moved = replace(logs[0], qpos=logs[0].qpos + later)
+    one, other = motion.estimated(predictor, [logs[0], moved], theta=TRUE, noise=NOISE[:9])
+    assert torch.equal(one.qvel[: row + 1], other.qvel[: row + 1])
+    assert not torch.equal(one.qvel[row + 1 :], other.qvel[row + 1 :])
+    assert not one.smoothed
+
+
+def test_an_error_that_was_carried_here_counts_less_than_one_that_was_fitted(robot):
+    predictor, logs, _ = robot
+    motion = FastMotion(tuple(range(9)), 20.0, share=0.01)
+    given = {"theta": TRUE, "noise": NOISE[:9]}
+    segments = cut(motion.estimated(predictor, logs[:1], **given), 5)
+    carried = start_noise(predictor, segments, NOISE[:9])
+    fitted = start_noise(predictor, replace(segments, smoothed=True), NOISE[:9])
+    ratio = fitted[..., 9:].std(0) / carried[..., 9:].std(0)
+    np.testing.assert_allclose(ratio, 1.5)
+    np.testing.assert_allclose(fitted[:9], carried[:9])

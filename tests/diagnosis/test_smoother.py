@@ -1,5 +1,7 @@
 """The smoother against exact conditioning of a linear system, whose states are jointly normal."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import torch
@@ -21,6 +23,7 @@ CARTS = """
 """
 NOISE, FORCE, SPREAD = 0.01, 0.02, 0.3  # m, m/s per step, m and m/s
 LENGTHS = 30, 22
+SHARES = np.array([0.1, 1.0, 10.0])
 
 
 def system():
@@ -96,11 +99,25 @@ def test_states_and_their_covariances_are_those_of_exact_conditioning():
 
 def test_the_likelihood_prefers_forces_as_strong_as_they_were():
     rng = np.random.default_rng(1)
-    shares = np.array([0.1, 1.0, 10.0])
     logs = [recorded(rng, 60)] * 3
     predictor = Predictor(system(), threads=1)
     first = Beliefs(np.zeros((3, 2)), np.zeros((3, 2)), np.tile(SPREAD**2 * np.eye(4), (3, 1, 1)))
-    forces = shares[:, None, None] ** 2 * np.diag([0, 0, FORCE**2, FORCE**2])
+    forces = SHARES[:, None, None] ** 2 * np.diag([0, 0, FORCE**2, FORCE**2])
     given = {"theta": np.zeros(0), "forces": forces, "noise": np.array([NOISE])}
     run = filtered(predictor, logs, first, keep=False, **given)
     assert run.likelihood.argmax() == 1
+
+
+def test_one_row_that_nobody_expected_does_not_make_all_forces_strong():
+    log = recorded(np.random.default_rng(1), 120)
+    jump = torch.zeros_like(log.qpos)
+    jump[30, 0] = 0.3  # as from a contact
+    hit = replace(log, qpos=log.qpos + jump)
+    predictor, count = Predictor(system(), threads=1), len(SHARES)
+    first = Beliefs(np.zeros((count, 2)), np.zeros((count, 2)),
+                    np.tile(SPREAD**2 * np.eye(4), (count, 1, 1)))  # fmt: skip
+    forces = SHARES[:, None, None] ** 2 * np.diag([0, 0, FORCE**2, FORCE**2])
+    given = {"theta": np.zeros(0), "forces": forces, "noise": np.array([NOISE]), "keep": False}
+    for one in (log, hit):
+        run = filtered(predictor, [one] * count, first, **given)
+        assert SHARES[run.likelihood.argmax()] == 1.0

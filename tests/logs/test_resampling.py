@@ -72,6 +72,18 @@ def test_parts_can_be_left_out(pendulum):
         resample(swing(0.01 * np.arange(30)), pendulum, leave_out=[(0, 29)])
 
 
+@pytest.mark.parametrize("period", [2, 3, 5])
+def test_motion_that_turns_from_row_to_row_loses_no_rows_at_its_ends(period):
+    rng = np.random.default_rng(0)
+    rows = np.arange(78)
+    swinging = np.cos(2 * np.pi * rows / period + 0.3) + 0.01 * rng.normal(size=78)
+    still = 0.01 * rng.normal(size=78)
+    windows = Windows(0.05 * rows)
+    assert velocity(windows, swinging)[2] <= 3
+    assert velocity(windows, still)[2] >= 13
+    assert velocity(windows, swinging + 300 * still)[2] >= 13  # much more noise
+
+
 @pytest.mark.parametrize("dt", [0.004, 0.01])
 def test_velocities_are_estimated_with_their_gain(pendulum_without_velocity, dt):
     rng = np.random.default_rng(0)

@@ -1,9 +1,11 @@
 """Velocities that were not measured, where the robot moves too fast to tell them from positions.
 
 A leg that swings forth and back within three rows has no slope that a polynomial through them could
-find; the simulator knows which swings lead from one row to the next. So a smoother (see `smoother`)
+find; the simulator knows which swings lead from one row to the next. So a filter (see `smoother`)
 carries the state along every log, the positions measured and the velocities asked for, with unknown
 forces as strong as makes the positions likeliest: a simulator that lacks something is trusted less.
+No smoother goes back: it would fit velocities to the rows that are to be predicted from them, by
+the simulator that is in question, and hide what that lacks.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from numpy.typing import NDArray
 from ..logs.log import Log
 from .prediction import Predictor
 from .segments import of_velocities
-from .smoother import Beliefs, filtered, likeliest_share, smoothed, unknown_forces
+from .smoother import Beliefs, filtered, likeliest_share, unknown_forces
 from .whitening import start_deviations
 
 Array = NDArray[np.float64]
@@ -33,7 +35,7 @@ _TRIAL = 80  # rows of each log on which the unknown forces' strength is chosen
 
 @dataclass(frozen=True, eq=False)
 class FastMotion:
-    """The degrees of freedom whose velocities a smoother has to tell.
+    """The degrees of freedom whose velocities a filter has to tell.
 
     Attributes:
         dofs: Those.
@@ -90,10 +92,9 @@ class FastMotion:
             share = likeliest_share(predictor, logs, first, theta=theta, noise=noise, rows=_TRIAL)
         forces = np.repeat(share**2 * unknown_forces(predictor)[None], len(logs), 0)
         run = filtered(predictor, logs, first, theta=theta, forces=forces, noise=noise)
-        states = smoothed(predictor, run, [len(log) for log in logs])
         surprises = np.stack(run.surprises, -1)
-        found = [self._filled(log, states, i, surprises[i]) for i, log in enumerate(logs)]
-        return found if self._sure(found, states) else list(logs)
+        found = [self._filled(log, run.beliefs, i, surprises[i]) for i, log in enumerate(logs)]
+        return found if self._sure(found, run.beliefs) else list(logs)
 
     def _first(self, predictor: Predictor, logs: Sequence[Log], noise: Array) -> Beliefs:
         """Return what may be believed before the first rows: what a polynomial says, widely."""

@@ -161,6 +161,7 @@ class Hidden:
             qpos=torch.from_numpy(predictor.tangent.displace(log.qpos.numpy(), step)),
             qvel=torch.from_numpy(np.where(wanted[size:], qvel, log.qvel.numpy())),
             uncertainty=torch.from_numpy(uncertainty),
+            smoothed=True,
         )
 
 

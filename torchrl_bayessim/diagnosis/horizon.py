@@ -20,7 +20,7 @@ from .whitening import drawn_starts, start_noise, whitening
 Array = NDArray[np.float64]
 _LADDER = (3, 5, 10, 20, 40, 80, 160)
 _LARGEST, _LARGEST_UNSURE = 0.2, 0.4  # of the median log's length
-_UNSURE = 20  # the least where start states were estimated
+_UNSURE = 20  # the least where start states were estimated from what they are to predict
 _FILTERED = 10  # where the depth of contacts was
 _PROBE = 100  # control steps on which horizons are compared
 _WORTH = 0.2  # nats per effect that a longer horizon must bring
@@ -43,13 +43,14 @@ def chosen_horizon(
     range, as long as second differences stay below first ones, and signatures much the same at
     another draw of the start's noise: what contacts scramble no fit can follow. Rows in which
     contacts make more of that noise than its linear view says count less. Where start states were
-    estimated, few steps hardly say how a segment began, and nothing else; nor where contacts
-    were, unless these many are scrambled.
+    estimated from what follows them, few steps hardly say how a segment began, and nothing else;
+    nor where contacts were, unless these many are scrambled.
     """
     typical = float(np.median([len(log) for log in logs]))
     guessed = any(log.uncertainty is not None for log in logs)
     filtered = any(log.touching is not None for log in logs)
-    least = _UNSURE if guessed else _FILTERED if filtered else 0
+    smoothed = any(log.smoothed for log in logs)
+    least = _UNSURE if smoothed else _FILTERED if filtered else 0
     longest = typical * (_LARGEST_UNSURE if guessed else _LARGEST)
     units = _one_of_each(units)
     shown = partial(_shown, predictor, logs, units=units, noise=noise, history=history)

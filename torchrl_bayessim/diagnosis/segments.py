@@ -47,6 +47,7 @@ class Segments:
         velocity_error: Of an estimated velocity, where motion is too fast for it, ``(nv,)``.
         uncertainty: Covariance of what was estimated of each start state, ``(S, 2 nv, 2 nv)``;
             nothing where all that matters was measured.
+        smoothed: Whether that estimate knows of the rows that are to be predicted from it.
         touching: What contacts say of each measured start; nothing where nothing touches.
     """
 
@@ -62,6 +63,7 @@ class Segments:
     velocity_gain: Array
     velocity_error: Array
     uncertainty: Array | None = None
+    smoothed: bool = False
     touching: Touching | None = None
 
     def __len__(self) -> int:
@@ -167,6 +169,7 @@ def cut(
         windows("ctrl"),
         *of_velocities(logs),
         uncertainty=_at(found, [log.uncertainty for log in logs]),
+        smoothed=any(log.smoothed for log in logs),
         touching=_touching(found, [log.touching for log in logs]),
     )
 

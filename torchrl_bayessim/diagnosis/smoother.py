@@ -5,6 +5,10 @@ seen with noise:
 
 .. math::  x_{t+1} = f(x_t, u_t) + w_t, \qquad y_t = H x_t + v_t.
 
+How strong the forces are, innovations :math:`e` with covariance :math:`S` say by Student's density
+:math:`-\frac{1}{2} \log |S| - \frac{\nu + n}{2} \log(1 + e^\top S^{-1} e / \nu)`: a contact that
+comes unexpectedly is no strong force in all other rows.
+
 The divided-difference filter (Nørgaard, Poulsen & Ravn 2000) carries mean and covariance
 :math:`P = S S^\top` forward; in place of derivatives it simulates one standard deviation to both
 sides of every direction, :math:`d_j = (f(x + s_j) - f(x - s_j)) / 2`, so that
@@ -32,6 +36,7 @@ Array = NDArray[np.float64]
 _SHARES = (1e-3, 3e-3, 1e-2, 3e-2, 1e-1)  # of the largest force of a joint, in one second
 _TINY = 1e-10  # of the variance: keeps covariances positive definite
 _LOST = 1e6  # squared innovation, in units of its variance, of a simulation that diverged
+_FREEDOM = 4.0  # of Student's density
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +65,7 @@ class Filtered:
     """What a filter leaves for the smoother.
 
     Attributes:
-        likelihood: Log density of each log's measurements, shape ``(N,)``.
+        likelihood: Log density of each log's measurements, less a constant, shape ``(N,)``.
         beliefs: After each row's measurement, length ``T``.
         predicted: Before it, by row; of the first row what was given.
         gains: Of the smoother, from each row to the one before.
@@ -214,13 +219,14 @@ class _Dynamics:
         gain = seen.swapaxes(1, 2) @ inverse
         step = np.einsum("nij,nj->ni", gain, innovation)
         distance = np.einsum("ni,nij,nj->n", innovation, inverse, innovation)
-        density = -0.5 * (np.minimum(distance, _LOST) + np.linalg.slogdet(spread)[1])
+        squares, size = np.minimum(distance, _LOST), innovation.shape[1]
+        density = -0.5 * (_FREEDOM + size) * np.log1p(squares / _FREEDOM)
+        density -= 0.5 * np.linalg.slogdet(spread)[1]
         # Joseph's form: unlike P - K H P it cannot lose its sign where sensors are very good
         kept = np.eye(seen.shape[2]) - gain @ np.eye(seen.shape[2])[channels]
         noise = (gain * self.noise**2) @ gain.swapaxes(1, 2)
         covariance = _symmetric(kept @ belief.covariance @ kept.swapaxes(1, 2) + noise)
-        surprise = np.minimum(distance, _LOST) / innovation.shape[1]
-        return _displaced(self.predictor, belief, step, covariance), density, surprise
+        return _displaced(self.predictor, belief, step, covariance), density, squares / size
 
     def moved(self, belief: Beliefs, t: int) -> tuple[Beliefs, Array]:
         """Return the belief one control step later, and the smoother's gain."""

@@ -94,7 +94,7 @@ def conclude(
         doubts: Why nothing should be named without reserve.
         alpha: Level of the tests.
     """
-    guessed = prepared.sets["train"].segments.uncertainty is not None
+    guessed = prepared.sets["train"].segments.smoothed
     weighed = _Weighed.of(
         selection, measured, effects, scattered=scattered, alpha=alpha, guessed=guessed
     )

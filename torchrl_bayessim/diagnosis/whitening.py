@@ -42,6 +42,7 @@ from .segments import Segments
 Array = NDArray[np.float64]
 _WORST = 1e3  # innovations beyond this, and those of diverged simulations, count as this
 _KNOWN = 3.0  # times the error of an estimate that knows what it is to predict
+_CARRIED = 2.0  # times that of one from earlier rows: what is missing pushes the same way for long
 _ROUNDING = 1e-13  # of the largest variance
 _MOST, _HALF, _CALM = 0.9, 0.5, 0.25  # shares of the segments that noise is estimated from
 _UNEVEN = 1.3  # ratio of the first two estimates, beyond which some segments hold more than noise
@@ -188,7 +189,8 @@ def start_noise(predictor: Predictor, segments: Segments, noise: Array) -> Array
     if segments.touching is not None:
         roots.append(_roots(segments.touching.error))
     if segments.uncertainty is not None:
-        roots.append(_KNOWN * _roots(segments.uncertainty))  # so does an estimated position
+        known = _KNOWN if segments.smoothed else _CARRIED
+        roots.append(known * _roots(segments.uncertainty))
     return np.concatenate(roots)
 
 

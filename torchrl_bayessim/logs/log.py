@@ -30,6 +30,7 @@ class Log:
             the beginning of the trajectory is known.
         uncertainty: Covariance of the errors of what was estimated and not measured, in the tangent
             space, ``(T, 2 nv, 2 nv)``; nothing where all that matters was measured.
+        smoothed: Whether estimates know of later rows, too, and not of earlier ones alone.
         touching: What contacts say of each state; nothing where nothing touches.
 
     All tensors of numbers are in double precision.
@@ -45,6 +46,7 @@ class Log:
     first_row: int = 0
     velocity_error: Tensor | None = None
     uncertainty: Tensor | None = None
+    smoothed: bool = False
     touching: Touching | None = None
 
     def __len__(self) -> int:

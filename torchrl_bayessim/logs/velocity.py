@@ -6,7 +6,9 @@ any times). With independent noise of standard deviation :math:`\sigma` on posit
 standard deviation :math:`g \sigma`, and the *gain* is :math:`g = \|w\|`.
 
 The width is chosen by leave-one-out prediction: the widest whose error is within a twentieth of
-the best.
+the best. What it leaves should be noise, one row like another. Where it swings back from row to
+row, the motion is faster than any polynomial, and a wide window would only lose the rows at the
+ends: the narrowest is taken.
 """
 
 from __future__ import annotations
@@ -23,6 +25,8 @@ from scipy.spatial.transform import Rotation
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 _HALF_WIDTHS = (2, 3, 4, 6, 9, 13, 19, 28)
+_SOON = 1, 2, 3  # rows, within which no polynomial swings there and back
+_SWINGING = -0.4  # correlation of what is left with itself so soon; of noise 0
 
 
 class Windows:
@@ -118,9 +122,17 @@ def _fitted(windows: Windows, near: Callable[[Rows], Array]) -> tuple[Array, flo
         leverage = smooth[rows == np.arange(len(rows))[:, None]]
         # a row differs from itself by zero, so what is fitted there is the residual
         residual = (smooth * differences).sum(-1) / (1 - leverage)
-        fits.append((np.mean(residual**2), half, (slope * differences).sum(-1), slope))
+        fits.append((np.mean(residual**2), half, (slope * differences).sum(-1), slope, residual))
         if fits[-1][0] > 2 * min(error for error, *_ in fits):
             break  # wider windows only bend more
     best = min(error for error, *_ in fits)
-    _, half, result, slope = [fit for fit in fits if fit[0] <= 1.05 * best][-1]
+    chosen = [fit for fit in fits if fit[0] <= 1.05 * best][-1]
+    _, half, result, slope, _ = fits[0] if _swings(chosen[-1]) else chosen
     return result, float(np.median(np.linalg.norm(slope, axis=1))), half
+
+
+def _swings(residual: Array) -> bool:
+    """Return whether residuals ``(*, T)`` turn round within a few rows, as noise does not."""
+    power = np.mean(residual**2)
+    later = [np.mean(residual[..., k:] * residual[..., :-k]) for k in _SOON]
+    return bool(min(later) < _SWINGING * power)
