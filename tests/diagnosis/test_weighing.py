@@ -12,7 +12,7 @@ from torchrl_bayessim.diagnosis.verdict import _Weighed
 
 def verdict(
     *, refit, left, sure, chance=False, validation=(1.0, 1.0), raw=9.0, ci=(-2.0, 1.0), count=1,
-    by_chance=1.0, laws=1, guessed=False,
+    by_chance=1.0, laws=1, guessed=False, strength=(0.1, 0.3),
 ):  # fmt: skip
     """Return the verdict on one effect: mean squared innovations of test runs and validation."""
     explained = (refit - left) / max(refit - 1.0, 1e-9)
@@ -32,7 +32,7 @@ def verdict(
     weighed = _Weighed.of(
         found,
         measured,
-        [SimpleNamespace(p_value=sure)] * count,
+        [SimpleNamespace(p_value=sure, ci95=strength)] * count,
         scattered={"losses"} if chance else set(),
         alpha=0.01,
         guessed=guessed,
@@ -66,6 +66,13 @@ def test_of_chance_on_a_small_gap_only_what_is_sure_is_named(sure, refit, said):
 )
 def test_a_cause_of_a_gap_too_small_to_show_must_help_somewhere(left, sure, validation, said):
     assert verdict(refit=0.95, left=left, sure=sure, validation=validation) == said
+
+
+@pytest.mark.parametrize(("sure", "said"), [(1e-3, "none"), (1e-40, "named_partial")])
+def test_an_effect_whose_strength_may_have_either_sign_is_none(sure, said):
+    seen = {"refit": 0.95, "left": 0.9, "sure": sure}
+    assert verdict(**seen) == "named_partial"
+    assert verdict(**seen, strength=(-0.2, 0.1)) == said
 
 
 @pytest.mark.parametrize(("sure", "said"), [(1e-3, "none"), (1e-40, "named_partial")])

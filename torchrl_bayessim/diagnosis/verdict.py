@@ -201,6 +201,8 @@ class _Weighed:
         borne_out = certain or measured.effects < measured.refit or validated >= PARTIAL
         found = p_value <= alpha and borne_out and bool(selection.best.units)
         found &= certain or not guessed
+        # a strength that may have either sign is no finding
+        found &= certain or not effects or any(not e.ci95[0] < 0 < e.ci95[1] for e in effects)
         significant = found or by_chance
         # told as one cause or not: together, laws imitate many a third one nearly
         several = len(effects) > 1 or len(selection.best.names) > 1
