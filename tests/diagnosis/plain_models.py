@@ -19,6 +19,7 @@ class Unit(NamedTuple):
     direction: tuple[float, ...] = (1.0,)
     group: str = ""  # default its name
     channel: str = "body"
+    low: float = -1.0
 
     def inside(self, strength):
         return min(strength, self.high)

@@ -80,10 +80,11 @@ def test_what_is_faster_than_its_sampling_the_simulator_tells():
     report = diagnose(system(), None, logs, effects=effects)
     assert report.verdict == "none"
     assert any("too fast for 20 rows a second" in alarm for alarm in report.alarms)
-    weak = [replace(log, ctrl=log.ctrl / 0.9) for log in logs]  # commands larger than what arrives
-    report = diagnose(system(), None, weak, effects=effects)
-    assert [effect.name for effect in report.effects] == ["action_gain"]
-    assert report.effects[0].strength == pytest.approx(-0.1, abs=0.02)
+    for gain in (-0.1, -0.3):  # commands larger than what arrives
+        weak = [replace(log, ctrl=log.ctrl / (1 + gain)) for log in logs]
+        report = diagnose(system(), None, weak, effects=effects)
+        assert [effect.name for effect in report.effects] == ["action_gain"]
+        assert report.effects[0].strength == pytest.approx(gain, abs=0.02)
 
 
 def test_what_neither_tells_is_not_testable(monkeypatch):

@@ -32,7 +32,7 @@ def verdict(
     weighed = _Weighed.of(
         found,
         measured,
-        [SimpleNamespace(p_value=sure, ci95=strength)] * count,
+        [SimpleNamespace(p_value=sure, ci95=strength, name=A.name)] * count,
         scattered={"losses"} if chance else set(),
         alpha=0.01,
         guessed=guessed,
@@ -73,6 +73,8 @@ def test_an_effect_whose_strength_may_have_either_sign_is_none(sure, said):
     seen = {"refit": 0.95, "left": 0.9, "sure": sure}
     assert verdict(**seen) == "named_partial"
     assert verdict(**seen, strength=(-0.2, 0.1)) == said
+    assert verdict(**seen, strength=(np.nan, np.nan)) == said
+    assert verdict(**seen, strength=(-0.2, 0.0)) == "named_partial"
 
 
 @pytest.mark.parametrize(("sure", "said"), [(1e-3, "none"), (1e-40, "named_partial")])

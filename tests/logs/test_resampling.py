@@ -7,6 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torchrl_bayessim.logs import velocity as module
 from torchrl_bayessim.logs.record import Record, record_of
 from torchrl_bayessim.logs.resampling import resample
 from torchrl_bayessim.logs.tables import Table
@@ -72,7 +73,20 @@ def test_parts_can_be_left_out(pendulum):
         resample(swing(0.01 * np.arange(30)), pendulum, leave_out=[(0, 29)])
 
 
-@pytest.mark.parametrize("period", [2, 3, 5])
+@pytest.mark.parametrize("period", [20, 30, 60])
+def test_smooth_motion_keeps_the_window_that_noise_asks_for(period, monkeypatch):
+    rows = np.arange(120)
+    windows = Windows(0.05 * rows)
+    rng = np.random.default_rng(0)
+    positions = [np.sin(2 * np.pi * rows / period) + 0.02 * rng.normal(size=120) for _ in range(20)]
+    positions += [np.round(rows / 4.3), np.round(20 * positions[0]) / 20]  # encoders
+    positions += [np.repeat(positions[0][::2], 2)]  # every other sample held
+    found = [velocity(windows, position)[2] for position in positions]
+    monkeypatch.setattr(module, "_swings", lambda *_: False)
+    assert found == [velocity(windows, position)[2] for position in positions]
+
+
+@pytest.mark.parametrize("period", [2, 3])
 def test_motion_that_turns_from_row_to_row_loses_no_rows_at_its_ends(period):
     rng = np.random.default_rng(0)
     rows = np.arange(78)

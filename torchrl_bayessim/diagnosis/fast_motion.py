@@ -5,7 +5,8 @@ find; the simulator knows which swings lead from one row to the next. So a filte
 carries the state along every log, the positions measured and the velocities asked for, with unknown
 forces as strong as makes the positions likeliest: a simulator that lacks something is trusted less.
 No smoother goes back: it would fit velocities to the rows that are to be predicted from them, by
-the simulator that is in question, and hide what that lacks.
+the simulator that is in question, and hide what that lacks. Only how sure they are knows a little
+of what follows: how well the simulator foresees the next two rows.
 """
 
 from __future__ import annotations

@@ -182,7 +182,7 @@ class _Weighed:
         least, lowest = min(measured.refit, *others), 1.0 + measured.excess_ci[0]
         shown = least > _UNEXPLAINED or (measured.refit > SHOWN and p_value < SURE)
         shown |= lowest > SHOWN and max(others) > _UNEXPLAINED
-        # where segments begin is itself an estimate with this simulator if it was not measured
+        # where segments begin is itself fitted with this simulator if nobody measured it
         visible = least > _PLAIN or (lowest > 1.0 and shown and not guessed)
         validated = share_on_validation(selection) if effects else 0.0
         # runs that hold little of what chance does say nothing against it, if it is sure
@@ -201,8 +201,7 @@ class _Weighed:
         borne_out = certain or measured.effects < measured.refit or validated >= PARTIAL
         found = p_value <= alpha and borne_out and bool(selection.best.units)
         found &= certain or not guessed
-        # a strength that may have either sign is no finding
-        found &= certain or not effects or any(not e.ci95[0] < 0 < e.ci95[1] for e in effects)
+        found &= certain or not _of_either_sign(selection, effects)
         significant = found or by_chance
         # told as one cause or not: together, laws imitate many a third one nearly
         several = len(effects) > 1 or len(selection.best.names) > 1
@@ -235,6 +234,13 @@ class _Weighed:
         # a share of an error that fitting made larger flatters the effects
         borne_out &= not measured.misled or measured.of_raw >= NAMED
         return "named" if borne_out and not left else "named_partial"
+
+
+def _of_either_sign(selection: Selection, effects: Sequence[Finding]) -> bool:
+    """Return whether all effects can push both ways, and may do so by their intervals."""
+    signed = {unit.name for unit in selection.best.units if unit.low < 0}
+    sure = any(e.name not in signed or e.ci95[0] >= 0 or e.ci95[1] <= 0 for e in effects)
+    return bool(effects) and not sure
 
 
 def _obstacle(system: System, prepared: Prepared, *, diverges: bool) -> tuple[str, str] | None:

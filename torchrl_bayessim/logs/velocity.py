@@ -6,9 +6,9 @@ any times). With independent noise of standard deviation :math:`\sigma` on posit
 standard deviation :math:`g \sigma`, and the *gain* is :math:`g = \|w\|`.
 
 The width is chosen by leave-one-out prediction: the widest whose error is within a twentieth of
-the best. What it leaves should be noise, one row like another. Where it swings back from row to
-row, the motion is faster than any polynomial, and a wide window would only lose the rows at the
-ends: the narrowest is taken.
+the best. What a wide one leaves should be noise, one row like another. Where that is much of how
+the position varies, and swings back within a few rows, the motion is faster than any polynomial,
+and a wide window would only lose the rows at the ends: the narrowest is taken.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 _HALF_WIDTHS = (2, 3, 4, 6, 9, 13, 19, 28)
 _SOON = 1, 2, 3  # rows, within which no polynomial swings there and back
-_SWINGING = -0.4  # correlation of what is left with itself so soon; of noise 0
+_SWINGING = -0.4  # correlation of what is left with itself so soon; of noise -0.2 on average
+_WIDE = 9  # half width from which noise alone is seldom correlated so
+_MUCH = 0.1  # of a position's variance
 
 
 class Windows:
@@ -127,12 +129,22 @@ def _fitted(windows: Windows, near: Callable[[Rows], Array]) -> tuple[Array, flo
             break  # wider windows only bend more
     best = min(error for error, *_ in fits)
     chosen = [fit for fit in fits if fit[0] <= 1.05 * best][-1]
-    _, half, result, slope, _ = fits[0] if _swings(chosen[-1]) else chosen
+    _, half, result, slope, residual = chosen
+    first = np.zeros((residual.shape[-1], 1), dtype=np.int64)
+    if half >= _WIDE and _swings(residual, near(first)[..., 0]):
+        _, half, result, slope, _ = fits[0]
     return result, float(np.median(np.linalg.norm(slope, axis=1))), half
 
 
-def _swings(residual: Array) -> bool:
-    """Return whether residuals ``(*, T)`` turn round within a few rows, as noise does not."""
+def _swings(residual: Array, moved: Array) -> bool:
+    """Return whether residuals ``(*, T)`` turn round within a few rows, as noise does not.
+
+    Args:
+        residual: Of a wide window.
+        moved: How far each row is from the first, ``(*, T)``.
+    """
     power = np.mean(residual**2)
+    if power < _MUCH * np.mean(np.var(moved, axis=-1)):
+        return False  # a smooth motion with what its sensor makes of it
     later = [np.mean(residual[..., k:] * residual[..., :-k]) for k in _SOON]
     return bool(min(later) < _SWINGING * power)
