@@ -97,15 +97,19 @@ def test_states_and_their_covariances_are_those_of_exact_conditioning():
             np.testing.assert_allclose(states[k].covariance[i], expected, atol=1e-6)
 
 
-def test_the_likelihood_prefers_forces_as_strong_as_they_were():
-    rng = np.random.default_rng(1)
-    logs = [recorded(rng, 60)] * 3
+def likeliest(log):
+    """Return which of ``SHARES`` of the true forces makes a log likeliest."""
     predictor = Predictor(system(), threads=1)
     first = Beliefs(np.zeros((3, 2)), np.zeros((3, 2)), np.tile(SPREAD**2 * np.eye(4), (3, 1, 1)))
     forces = SHARES[:, None, None] ** 2 * np.diag([0, 0, FORCE**2, FORCE**2])
     given = {"theta": np.zeros(0), "forces": forces, "noise": np.array([NOISE])}
-    run = filtered(predictor, logs, first, keep=False, **given)
-    assert run.likelihood.argmax() == 1
+    run = filtered(predictor, [log] * len(SHARES), first, keep=False, **given)
+    return SHARES[run.likelihood.argmax()]
+
+
+def test_the_likelihood_prefers_forces_as_strong_as_they_were():
+    rng = np.random.default_rng(1)
+    assert likeliest(recorded(rng, 60)) == 1.0
 
 
 def test_one_row_that_nobody_expected_does_not_make_all_forces_strong():
@@ -113,11 +117,4 @@ def test_one_row_that_nobody_expected_does_not_make_all_forces_strong():
     jump = torch.zeros_like(log.qpos)
     jump[30, 0] = 0.3  # as from a contact
     hit = replace(log, qpos=log.qpos + jump)
-    predictor, count = Predictor(system(), threads=1), len(SHARES)
-    first = Beliefs(np.zeros((count, 2)), np.zeros((count, 2)),
-                    np.tile(SPREAD**2 * np.eye(4), (count, 1, 1)))  # fmt: skip
-    forces = SHARES[:, None, None] ** 2 * np.diag([0, 0, FORCE**2, FORCE**2])
-    given = {"theta": np.zeros(0), "forces": forces, "noise": np.array([NOISE]), "keep": False}
-    for one in (log, hit):
-        run = filtered(predictor, [one] * count, first, **given)
-        assert SHARES[run.likelihood.argmax()] == 1.0
+    assert likeliest(log) == likeliest(hit) == 1.0

@@ -62,7 +62,7 @@ class Beliefs:
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
-    """What a filter leaves for the smoother.
+    """What a filter says of every row, and what the smoother goes back with.
 
     Attributes:
         likelihood: Log density of each log's measurements, less a constant, shape ``(N,)``.

@@ -128,8 +128,7 @@ def _fitted(windows: Windows, near: Callable[[Rows], Array]) -> tuple[Array, flo
         if fits[-1][0] > 2 * min(error for error, *_ in fits):
             break  # wider windows only bend more
     best = min(error for error, *_ in fits)
-    chosen = [fit for fit in fits if fit[0] <= 1.05 * best][-1]
-    _, half, result, slope, residual = chosen
+    _, half, result, slope, residual = [fit for fit in fits if fit[0] <= 1.05 * best][-1]
     first = np.zeros((residual.shape[-1], 1), dtype=np.int64)
     if half >= _WIDE and _swings(residual, near(first)[..., 0]):
         _, half, result, slope, _ = fits[0]
