@@ -11,7 +11,7 @@ from __future__ import annotations
 
 __all__ = ["resample"]
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import mujoco
 import numpy as np
@@ -24,11 +24,12 @@ from .columns import joint_names
 from .log import Log
 from .record import Record, unwrapped, usable_rows
 from .system import System
-from .velocity import Windows, angular_velocity, velocity
+from .velocity import Estimate, Windows, angular_velocity, velocity
 
 Array = NDArray[np.float64]
 _GAP = 5.0  # steps without a row after which a record is split
 _COARSEST = 10.0  # control steps that rows may usually be apart, to be interpolated
+_MOST = 0.5  # of the positions of a record
 _ROTATIONS = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
 
 
@@ -122,23 +123,38 @@ def _velocities(
     model, columns = system.task.model, system.columns
     gain = np.zeros(model.nv)
     result = np.nan_to_num(qvel)
-    margin, windows = 0, Windows(time)
-    for j, joint in enumerate(joint_names(model)):
-        if joint in columns.qvel or joint not in columns.qpos:
-            continue
-        if len(time) < 5:
-            return None, gain, 0
+    needed = [
+        j
+        for j, joint in enumerate(joint_names(model))
+        if joint in columns.qpos and joint not in columns.qvel
+    ]
+    if not needed:
+        return result, gain, 0
+    if len(time) < 5:
+        return None, gain, 0
+    found = _slopes(Windows(time), qpos, model, needed)
+    if np.mean([estimate.swings for _, estimate in found]) > _MOST:
+        # the others' windows would cost rows at both ends, which the motion needs more than they
+        found = _slopes(Windows(time, narrow=True), qpos, model, needed)
+    for place, estimate in found:
+        result[:, place], gain[place] = estimate.velocity, estimate.gain
+    return result, gain, max(estimate.half_width for _, estimate in found)
+
+
+def _slopes(
+    windows: Windows, qpos: Array, model: mujoco.MjModel, joints: Sequence[int]
+) -> list[tuple[int | slice, Estimate]]:
+    """Return degrees of freedom and estimates of what they did."""
+    found: list[tuple[int | slice, Estimate]] = []
+    for j in joints:
         q, v = model.jnt_qposadr[j], model.jnt_dofadr[j]
-        plain = _ROTATIONS.get(int(model.jnt_type[j]), 1)
-        for i in range(plain):
-            result[:, v + i], gain[v + i], half = velocity(windows, qpos[:, q + i])
-            margin = max(margin, half)
-        if int(model.jnt_type[j]) in _ROTATIONS:
-            place = slice(v + plain, v + plain + 3)
+        kind = int(model.jnt_type[j])
+        plain = _ROTATIONS.get(kind, 1)
+        found += [(v + i, velocity(windows, qpos[:, q + i])) for i in range(plain)]
+        if kind in _ROTATIONS:
             quaternions = qpos[:, q + plain : q + plain + 4]
-            result[:, place], gain[place], half = angular_velocity(windows, quaternions)
-            margin = max(margin, half)
-    return result, gain, margin
+            found.append((slice(v + plain, v + plain + 3), angular_velocity(windows, quaternions)))
+    return found
 
 
 def _interpolated(

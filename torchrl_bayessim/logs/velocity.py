@@ -13,10 +13,10 @@ and a wide window would only lose the rows at the ends: the narrowest is taken.
 
 from __future__ import annotations
 
-__all__ = ["Windows", "angular_velocity", "velocity"]
+__all__ = ["Estimate", "Windows", "angular_velocity", "velocity"]
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,14 +31,33 @@ _WIDE = 9  # half width from which noise alone is seldom correlated so
 _MUCH = 0.1  # of a position's variance
 
 
+class Estimate(NamedTuple):
+    """A velocity from positions.
+
+    Attributes:
+        velocity: Shape ``(T,)`` or ``(T, 3)``. The first and last ``half_width`` rows are fitted
+            from one side and have larger gains.
+        gain: The median over rows, 1/s.
+        half_width: Of the window, rows.
+        swings: Whether the position turns round faster than any polynomial.
+    """
+
+    velocity: Array
+    gain: float
+    half_width: int
+    swings: bool
+
+
 class Windows:
     """Least squares around every row, set up once for all positions of a record.
 
     Args:
         time: Increasing, shape ``(T,)``, at least 5 rows.
+        narrow: Whether to offer the narrowest window only.
     """
 
-    def __init__(self, time: Array) -> None:
+    def __init__(self, time: Array, *, narrow: bool = False) -> None:
+        self._offered = _HALF_WIDTHS[:1] if narrow else _HALF_WIDTHS
         self._time, self._step = time, np.diff(time).mean()
         self._even = bool(np.abs(np.diff(time) - self._step).max() <= 0.02 * self._step)
         self._fits: dict[int, tuple[Rows, Array, Array]] = {}
@@ -46,8 +65,8 @@ class Windows:
     @property
     def half_widths(self) -> list[int]:
         """Half widths ``h`` that leave at least as many rows outside as inside."""
-        fitting = [h for h in _HALF_WIDTHS if 2 * h + 1 <= len(self._time) // 2]
-        return fitting or [2]
+        fitting = [h for h in self._offered if 2 * h + 1 <= len(self._time) // 2]
+        return fitting or [_HALF_WIDTHS[0]]
 
     def fit(self, half: int) -> tuple[Rows, Array, Array]:
         """Return each row's window, and the weights of the value and of the slope, ``(T, w)``."""
@@ -65,29 +84,24 @@ class Windows:
         return self._fits[half]
 
 
-def velocity(windows: Windows, position: Array) -> tuple[Array, float, int]:
-    """Return the velocity, its gain and the half width ``h`` of the window.
+def velocity(windows: Windows, position: Array) -> Estimate:
+    """Estimate the velocity of a hinge or slide.
 
     Args:
         windows: Of the record's times.
         position: Shape ``(T,)``.
 
-    Returns:
-        Shape ``(T,)``; the median gain, 1/s; ``h``. The first and last ``h`` rows are fitted from
-        one side and have larger gains.
-
     Example:
         >>> t = np.arange(50) * 0.01
-        >>> slope, gain, half = velocity(Windows(t), np.sin(3 * t))
+        >>> slope = velocity(Windows(t), np.sin(3 * t)).velocity
         >>> bool(np.abs(slope - 3 * np.cos(3 * t)).max() < 1e-3)
         True
     """
-    slope, gain, half = _fitted(windows, lambda rows: position[rows] - position[:, None])
-    return slope, gain, half
+    return _fitted(windows, lambda rows: position[rows] - position[:, None])
 
 
-def angular_velocity(windows: Windows, quaternion: Array) -> tuple[Array, float, int]:
-    """Return angular velocities in the frame of the body, shape ``(T, 3)``; else as `velocity`.
+def angular_velocity(windows: Windows, quaternion: Array) -> Estimate:
+    """Estimate angular velocities in the frame of the body, shape ``(T, 3)``.
 
     Args:
         windows: Of the record's times.
@@ -102,8 +116,7 @@ def angular_velocity(windows: Windows, quaternion: Array) -> tuple[Array, float,
         turns = (own.inv() * other).as_rotvec().reshape(*rows.shape, 3)
         return np.moveaxis(turns, -1, 0)
 
-    slope, gain, half = _fitted(windows, near)
-    return slope.T, gain, half
+    return _fitted(windows, near)
 
 
 def _weights(offset: NDArray[Any]) -> tuple[Array, Array]:
@@ -115,7 +128,7 @@ def _weights(offset: NDArray[Any]) -> tuple[Array, Array]:
     return weights[:, 0], weights[:, 1] / scale
 
 
-def _fitted(windows: Windows, near: Callable[[Rows], Array]) -> tuple[Array, float, int]:
+def _fitted(windows: Windows, near: Callable[[Rows], Array]) -> Estimate:
     """Fit in windows of every width; ``near`` gives what neighbours differ by, ``(*, T, w)``."""
     fits = []
     for half in windows.half_widths:
@@ -130,9 +143,10 @@ def _fitted(windows: Windows, near: Callable[[Rows], Array]) -> tuple[Array, flo
     best = min(error for error, *_ in fits)
     _, half, result, slope, residual = [fit for fit in fits if fit[0] <= 1.05 * best][-1]
     first = np.zeros((residual.shape[-1], 1), dtype=np.int64)
-    if half >= _WIDE and _swings(residual, near(first)[..., 0]):
+    swings = half >= _WIDE and _swings(residual, near(first)[..., 0])
+    if swings:
         _, half, result, slope, _ = fits[0]
-    return result, float(np.median(np.linalg.norm(slope, axis=1))), half
+    return Estimate(result.T, float(np.median(np.linalg.norm(slope, axis=1))), half, swings)
 
 
 def _swings(residual: Array, moved: Array) -> bool:
