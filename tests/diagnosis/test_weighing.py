@@ -1,5 +1,6 @@
 """What speaks for a cause where test runs hardly show the gap, or speak against it."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,11 +11,21 @@ from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
 from torchrl_bayessim.diagnosis.verdict import _Weighed
 
 
+def with_fit(model, first, others):
+    """Return a model with other mean squared innovations in the segments that it is fitted to."""
+    left = np.full_like(model.fit.innovations, np.sqrt(others))
+    left[0] = np.sqrt(first)
+    return replace(model, fit=replace(model.fit, innovations=left))
+
+
 def verdict(
     *, refit, left, sure, chance=False, validation=(1.0, 1.0), raw=9.0, ci=(-2.0, 1.0), count=1,
-    by_chance=1.0, laws=1, guessed=False, strength=(0.1, 0.3),
+    by_chance=1.0, laws=1, guessed=False, strength=(0.1, 0.3), fitted=None,
 ):  # fmt: skip
-    """Return the verdict on one effect: mean squared innovations of test runs and validation."""
+    """Return the verdict on one effect: mean squared innovations of test runs and validation.
+
+    Segments of the fit have those of validation, or before and after what ``fitted`` says of each.
+    """
     explained = (refit - left) / max(refit - 1.0, 1e-9)
     share = float(np.clip(explained, -1.0, 1.0))
     excess = (-0.2, 0.3) if refit < 1.05 else (0.5 * (refit - 1.0), 2 * refit)
@@ -24,6 +35,8 @@ def verdict(
         plain(there, 4000 * mean, segments=40, width=100)
         for there, mean in zip(((), units), validation, strict=True)
     ]
+    if fitted is not None:
+        models = [with_fit(model, *means) for model, means in zip(models, fitted, strict=True)]
     found = SimpleNamespace(
         p_values=[1.0 if chance else sure],
         nominal=models[0],
@@ -157,5 +170,28 @@ def test_what_all_other_runs_show_of_a_gap_no_larger_than_noise_is_named(changes
         "sure": 1e-5,
         "ci": (-9.0, 1.0),
         "validation": (1.1, 1.08),
+    }
+    assert verdict(**(known | changes)) == said
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "named_partial"),
+        ({"left": 1.12}, "unknown"),  # test runs speak against it
+        ({"refit": 1.3, "left": 1.3}, "unknown"),  # which show the gap, but not this law
+        ({"validation": (0.95, 0.96)}, "unknown"),
+        ({"sure": 1e-12}, "none"),
+        ({"fitted": ((1.8, 1.8), (1.3, 1.3))}, "unknown"),  # it leaves some
+        ({"fitted": ((20.0, 0.9), (0.9, 0.9))}, "unknown"),  # a single segment is odd
+    ],
+)
+def test_what_runs_of_the_fit_show_alone_is_named_if_it_leaves_nothing_there(changes, said):
+    known = {
+        "refit": 1.08,
+        "left": 1.08,
+        "sure": 1e-40,
+        "validation": (0.95, 0.948),
+        "fitted": ((1.8, 1.8), (0.9, 0.9)),
     }
     assert verdict(**(known | changes)) == said

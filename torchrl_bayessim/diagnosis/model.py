@@ -16,6 +16,7 @@ __all__ = [
     "numbers",
     "price",
     "shown",
+    "shown_by_the_fit",
     "shown_together",
     "total_gain",
 ]
@@ -37,6 +38,7 @@ _CHANCE = 0.01  # of a test that two models explain the data equally well
 _NEXT_TO_NOTHING, _OF_ITS_OWN = 0.03, 0.05  # of what all runs of the fit gain; of one's deviance
 _WORSE = 1.5  # times the misfit of the best model: too much for an equal, however few the data
 _CERTAIN, _SEVERAL = 5.0, 2  # times what judging runs must gain; runs of the fit that gain it
+_BESIDE = 100.0  # deviance that segments gain beside the one that gains most, which may be odd
 _TOGETHER = 6.0  # the same of all runs together, where noise alone seems left
 WHITE = 1.2  # mean squared innovation of a model that leaves noise alone
 
@@ -175,6 +177,19 @@ def shown_together(base: Model, model: Model) -> bool:
     several = together - alone > least
     sure = together > _TOGETHER * least * (1.0 if several else 2.0)
     return base.mean_square < WHITE and sure and gain(base, model) >= 0
+
+
+def shown_by_the_fit(base: Model, model: Model) -> bool:
+    """Return whether a model leaves noise alone of what shows in the runs of the fit.
+
+    Those that judge may not say the opposite. A speed limit shows where the robot is fast, which
+    may have been in one run; a law that is not it would leave some of what it does, where that is
+    more than a segment.
+    """
+    before, after = (m.fit.innovations**2 for m in (base, model))
+    gains = (before - after).sum(-1)
+    gone = before.mean() > WHITE > max(float(after.mean()), model.mean_square)
+    return bool(gone and gains.sum() - gains.max() > _BESIDE and gain(base, model) >= 0)
 
 
 def as_good(best: Model, rival: Model) -> bool:

@@ -10,8 +10,9 @@ how much of it the effects explain, not only whether it is significant::
     named_partial  effects explain at least 40 %; the rest is located. Or 80 % on validation runs,
                    where test runs hardly show the gap. Or perhaps 40 %, of a cause that is certain
                    and surely helps on test runs, and leaves less than the noise once more. Or of a
-                   gap hardly above noise what all other runs together show (p < 1e-4), or chance
-                   that is certain, where test runs do not speak against it
+                   gap hardly above noise what all other runs together show (p < 1e-4), what those
+                   of the fit surely show and noise alone is left of, or chance that is certain,
+                   where test runs do not speak against it
     ambiguous      effects of different kinds explain the data equally well
     unknown        the gap is real, and the catalogue explains less than 40 % of it, or perhaps none
     not_testable   the data are too few or too uniform to say
@@ -29,7 +30,7 @@ import numpy as np
 
 from ..logs.system import System
 from .divergence import HINT
-from .model import shown_together
+from .model import shown_by_the_fit, shown_together
 from .preparation import Prepared
 from .report import Candidate, Finding, Verdict
 from .selection import Selection
@@ -149,7 +150,7 @@ class _Weighed:
         elsewhere: Whether validation runs do in their place.
         helps: Whether it surely helps on test runs, however much of the gap it explains.
         together: Whether all other runs together show it, of a gap that is hardly above noise, or
-            it is chance and certain.
+            those of the fit surely do, and all of it, or it is chance and certain.
         several: Whether several effects were found.
     """
 
@@ -189,6 +190,8 @@ class _Weighed:
         surely = min((e.p_value for e in effects), default=1.0) < _CERTAIN
         by_chance = bool(scattered) and (surely or measured.refit > SHOWN)
         together = p_value < _DOUBTLESS and shown_together(selection.nominal, selection.best)
+        fitted = certain and shown_by_the_fit(selection.nominal, selection.best)
+        together |= fitted and measured.refit < SHOWN
         together |= bool(scattered) and surely and measured.refit < SHOWN
         together &= measured.effects < _NO_WORSE * measured.refit and not guessed
         perhaps_nothing = measured.explained_ci[0] <= 0 and validated < PARTIAL and not by_chance
