@@ -27,10 +27,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from ..logs.system import System
 from .divergence import HINT
-from .model import shown_by_the_fit, shown_together
+from .model import numbers, shown_by_the_fit, shown_together, total_gain
 from .preparation import Prepared
 from .report import Candidate, Finding, Verdict
 from .selection import Selection
@@ -202,9 +203,10 @@ class _Weighed:
         helps = certain and measured.p_value < alpha and measured.explained_ci[1] >= PARTIAL
         helps &= measured.effects <= _NOISE_AGAIN
         borne_out = certain or measured.effects < measured.refit or validated >= PARTIAL
-        found = p_value <= alpha and borne_out and bool(selection.best.units)
+        found = p_value <= alpha and borne_out
         found &= certain or not guessed
         found &= certain or not _of_either_sign(selection, effects)
+        found &= bool(selection.best.units) and _by_chance(selection) <= alpha
         significant = found or by_chance
         # told as one cause or not: together, laws imitate many a third one nearly
         several = len(effects) > 1 or len(selection.best.names) > 1
@@ -237,6 +239,16 @@ class _Weighed:
         # a share of an error that fitting made larger flatters the effects
         borne_out &= not measured.misled or measured.of_raw >= NAMED
         return "named" if borne_out and not left else "named_partial"
+
+
+def _by_chance(selection: Selection) -> float:
+    """Return how often noise alone would let the fit of any effect gain as much.
+
+    A screen says what a law would gain that is as much larger as its match, which not every law is:
+    a step of commands that is twice as wide rounds others.
+    """
+    gained = total_gain(selection.nominal, selection.best)
+    return len(selection.offered) * float(chi2.sf(gained, numbers(selection.best)))
 
 
 def _of_either_sign(selection: Selection, effects: Sequence[Finding]) -> bool:
