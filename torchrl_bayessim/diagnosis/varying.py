@@ -175,14 +175,14 @@ def _by_rows(objective: Objective, point: Point, unit: Unit, step: float) -> Arr
 
 def _drawn(sets: Mapping[str, Objective], point: Point, unit: Unit) -> list[Varying]:
     """Return an effect of chance at several strengths."""
-    found = []
-    for strength in (level * unit.high for level in _LEVELS):
-        with_it = Point(point.z, {**point.strengths, unit: strength})
+    strengths, found = [level * unit.high for level in _LEVELS], []
+    points = [Point(point.z, {**point.strengths, unit: strength}) for strength in strengths]
+    draws = {name: drawn(one, points, _DRAWS) for name, one in sets.items()}
+    for i, strength in enumerate(strengths):
         what = f"commands come late by up to {strength:.2g} {unit.effect.unit} more at {unit.where}"
         if unit.effect.unit != "s":
             what = f"commands come late at {unit.where}, one of {1 / strength:.0f}"
-        draws = {name: drawn(one, [with_it], _DRAWS)[0] for name, one in sets.items()}
-        roots = {name: scattered(each).transpose(0, 2, 1) for name, each in draws.items()}
+        roots = {name: scattered(each[i]).transpose(0, 2, 1) for name, each in draws.items()}
         found.append(Varying(what, _LATE, roots))
     return found
 
