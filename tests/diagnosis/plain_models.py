@@ -34,6 +34,7 @@ class Unit(NamedTuple):
         return SimpleNamespace(
             group=self.group or self.name,
             placed=(),
+            form={},
             channel=self.channel,
             joint=lambda robot, target: joint,
         )

@@ -68,6 +68,14 @@ def test_the_only_run_in_which_much_is_missing_trains():
     assert dealt_anew(parts, left) is parts
 
 
+@pytest.mark.parametrize("runs", [3, 4])
+def test_of_few_runs_the_odd_one_is_not_what_parameters_are_fitted_to(runs):
+    parts = split(rides(steps=(200,) * runs, scales=(1.0,) * runs))
+    left = {name: np.ones(len(logs)) for name, logs in parts.items()}
+    left["validation"][0] = 9.0
+    assert dealt_anew(parts, left) is parts
+
+
 @pytest.mark.parametrize(
     ("train", "validation", "test"),
     [
@@ -110,7 +118,7 @@ def test_a_cause_that_shows_in_two_training_runs_only_is_found():
     assert {"run0", "run3"} & {*report.audit["validation"]}
 
 
-def test_a_cause_that_shows_in_one_run_only_is_found():
+def test_a_cause_that_shows_in_one_run_only_is_found_where_that_run_trains():
     steps = 400, 300, 230, 180, 140, 140, 140, 140
     logs = rides(lambda t, q: -2.0 * q, steps, (0.01, 0.01, 1, *[0.01] * 5))
     assert "run2" not in names(split(logs)["train"])

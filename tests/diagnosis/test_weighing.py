@@ -132,6 +132,12 @@ def test_two_effects_may_leave_less_than_one(count, left, said):
     assert answer == said
 
 
+@pytest.mark.parametrize(("laws", "said"), [(1, "named_partial"), (2, "none")])
+def test_chance_finds_more_among_pairs_than_among_effects(laws, said):
+    known = {"refit": 0.95, "left": 0.9, "sure": 1e-3, "validation": (1.0, 0.995)}
+    assert verdict(**known, laws=laws) == said
+
+
 def test_two_laws_that_are_told_as_one_cause_may_leave_less_than_one():
     known = {"refit": 200.0, "raw": 300.0, "left": 1.9, "sure": 1e-20, "ci": (0.9, 1.0)}
     assert verdict(**known, validation=(9.0, 1.1), laws=1) == "named"
@@ -182,7 +188,9 @@ def test_what_all_other_runs_show_of_a_gap_no_larger_than_noise_is_named(changes
         ({}, "named_partial"),
         ({"left": 1.12}, "unknown"),  # test runs speak against it
         ({"refit": 1.3, "left": 1.3}, "unknown"),  # which show the gap, but not this law
+        ({"validation": (0.95, 0.951)}, "named_partial"),  # a loss that chance often makes
         ({"validation": (0.95, 0.96)}, "unknown"),
+        ({"validation": (1.45, 1.45)}, "unknown"),  # validation runs show it, but not this law
         ({"sure": 1e-12}, "none"),
         ({"fitted": ((1.8, 1.8), (1.3, 1.3))}, "unknown"),  # it leaves some
         ({"fitted": ((20.0, 0.9), (0.9, 0.9))}, "unknown"),  # a single segment is odd

@@ -119,6 +119,8 @@ def test_where_most_joints_swing_the_others_cost_no_rows_either(swinging, rows):
     )
     (log,) = resample(record, system)
     assert len(log) == rows
+    again = Windows.like(log.time.numpy(), log.velocity_gain.numpy())
+    assert (again.half_widths == [2]) == (swinging == 2)
 
 
 @pytest.mark.parametrize("dt", [0.004, 0.01])

@@ -188,8 +188,8 @@ def shown_by_the_fit(base: Model, model: Model) -> bool:
     """
     before, after = (m.fit.innovations**2 for m in (base, model))
     gains = (before - after).sum(-1)
-    gone = before.mean() > WHITE > max(float(after.mean()), model.mean_square)
-    return bool(gone and gains.sum() - gains.max() > _BESIDE and gain(base, model) >= 0)
+    gone = before.mean() > WHITE > max(float(after.mean()), model.dispersion())
+    return bool(gone and gains.sum() - gains.max() > _BESIDE and gain(base, model) > -LIKELY)
 
 
 def as_good(best: Model, rival: Model) -> bool:

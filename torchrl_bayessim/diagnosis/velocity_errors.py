@@ -45,7 +45,8 @@ def with_velocity_errors(predictor: Predictor, logs: Sequence[Log], theta: Array
         if len(positions) < _ROWS:
             continue
         rows = np.arange(len(positions), dtype=np.float64)
-        windows = Windows(predictor.system.control_dt * rows)
+        times = predictor.system.control_dt * rows
+        windows = Windows.like(times, log.velocity_gain.numpy())
         for q, v in zip(robot.qpos_index, robot.dof_index, strict=True):
             if log.velocity_gain[v] > 0:
                 slope, _, half, _ = velocity(windows, positions[:, q])

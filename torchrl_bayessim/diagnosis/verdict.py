@@ -24,6 +24,7 @@ __all__ = ["conclude"]
 
 from collections.abc import Collection, Mapping, Sequence, Set
 from dataclasses import dataclass
+from math import comb
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,8 @@ from scipy.stats import chi2
 
 from ..logs.system import System
 from .divergence import HINT
-from .model import numbers, shown_by_the_fit, shown_together, total_gain
+from .free_numbers import fitted_numbers
+from .model import shown_by_the_fit, shown_together, total_gain
 from .preparation import Prepared
 from .report import Candidate, Finding, Verdict
 from .selection import Selection
@@ -206,7 +208,7 @@ class _Weighed:
         found = p_value <= alpha and borne_out
         found &= certain or not guessed
         found &= certain or not _of_either_sign(selection, effects)
-        found &= bool(selection.best.units) and _by_chance(selection) <= alpha
+        found &= bool(selection.best.units) and _gained_by_noise(selection) <= alpha
         significant = found or by_chance
         # told as one cause or not: together, laws imitate many a third one nearly
         several = len(effects) > 1 or len(selection.best.names) > 1
@@ -241,14 +243,15 @@ class _Weighed:
         return "named" if borne_out and not left else "named_partial"
 
 
-def _by_chance(selection: Selection) -> float:
-    """Return how often noise alone would let the fit of any effect gain as much.
+def _gained_by_noise(selection: Selection) -> float:
+    """Return how often noise alone would let fits of any so many effects gain as much.
 
-    A screen says what a law would gain that is as much larger as its match, which not every law is:
-    a step of commands that is twice as wide rounds others.
+    The screen extrapolates a match in proportion to strength; a law that is not proportional, such
+    as rounding, may gain nothing when it is fitted.
     """
-    gained = total_gain(selection.nominal, selection.best)
-    return len(selection.offered) * float(chi2.sf(gained, numbers(selection.best)))
+    best, offered = selection.best, selection.offered
+    tail = chi2.sf(total_gain(selection.nominal, best), fitted_numbers(best, offered))
+    return min(1.0, comb(len(offered), len(best.names)) * float(tail))
 
 
 def _of_either_sign(selection: Selection, effects: Sequence[Finding]) -> bool:

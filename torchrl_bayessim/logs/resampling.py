@@ -5,6 +5,8 @@ rotations the same in the tangent space of the first row; velocities are interpo
 action of a step is the average over it of the actions held. A record that already is on the grid,
 to within a fiftieth of a step, is taken as it is. Jumps of hinges by a turn are undone. A record is
 split where rows are left out or not finite, and at gaps, across which nothing is invented.
+Where most joints of a record swing faster than any window of its rows can follow, velocities of all
+are estimated in the narrowest (see `velocity`), which costs the fewest rows at both ends.
 """
 
 from __future__ import annotations

@@ -28,6 +28,7 @@ _HALF_WIDTHS = (2, 3, 4, 6, 9, 13, 19, 28)
 _SOON = 1, 2, 3  # rows, within which no polynomial swings there and back
 _SWINGING = -0.4  # correlation of what is left with itself so soon; of noise -0.2 on average
 _WIDE = 9  # half width from which noise alone is seldom correlated so
+_AS_NARROW = 0.9  # of the gain of the narrowest window
 _MUCH = 0.1  # of a position's variance
 
 
@@ -39,7 +40,7 @@ class Estimate(NamedTuple):
             from one side and have larger gains.
         gain: The median over rows, 1/s.
         half_width: Of the window, rows.
-        swings: Whether the position turns round faster than any polynomial.
+        swings: Whether the narrowest window was taken although a wide one predicted better.
     """
 
     velocity: Array
@@ -62,6 +63,18 @@ class Windows:
         self._even = bool(np.abs(np.diff(time) - self._step).max() <= 0.02 * self._step)
         self._fits: dict[int, tuple[Rows, Array, Array]] = {}
 
+    @classmethod
+    def like(cls, time: Array, gains: Array) -> Windows:
+        """Return the windows that velocities of a log were estimated in.
+
+        Args:
+            time: Of the log.
+            gains: Of its velocities, 1/s; zero where they were measured.
+        """
+        narrow = cls(time, narrow=True)
+        least = gains[gains > 0].min(initial=np.inf)
+        return narrow if np.inf > least > _AS_NARROW * narrow.gain(_HALF_WIDTHS[0]) else cls(time)
+
     @property
     def half_widths(self) -> list[int]:
         """Half widths ``h`` that leave at least as many rows outside as inside."""
@@ -82,6 +95,10 @@ class Windows:
                 smooth, slope = _weights(self._time[rows] - self._time[:, None])
             self._fits[half] = rows, smooth, slope
         return self._fits[half]
+
+    def gain(self, half: int) -> float:
+        """Return the noise of a velocity per noise of positions, 1/s, the median over rows."""
+        return float(np.median(np.linalg.norm(self.fit(half)[2], axis=1)))
 
 
 def velocity(windows: Windows, position: Array) -> Estimate:
@@ -137,16 +154,16 @@ def _fitted(windows: Windows, near: Callable[[Rows], Array]) -> Estimate:
         leverage = smooth[rows == np.arange(len(rows))[:, None]]
         # a row differs from itself by zero, so what is fitted there is the residual
         residual = (smooth * differences).sum(-1) / (1 - leverage)
-        fits.append((np.mean(residual**2), half, (slope * differences).sum(-1), slope, residual))
+        fits.append((np.mean(residual**2), half, (slope * differences).sum(-1), residual))
         if fits[-1][0] > 2 * min(error for error, *_ in fits):
             break  # wider windows only bend more
     best = min(error for error, *_ in fits)
-    _, half, result, slope, residual = [fit for fit in fits if fit[0] <= 1.05 * best][-1]
+    _, half, result, residual = [fit for fit in fits if fit[0] <= 1.05 * best][-1]
     first = np.zeros((residual.shape[-1], 1), dtype=np.int64)
     swings = half >= _WIDE and _swings(residual, near(first)[..., 0])
     if swings:
-        _, half, result, slope, _ = fits[0]
-    return Estimate(result.T, float(np.median(np.linalg.norm(slope, axis=1))), half, swings)
+        _, half, result, _ = fits[0]
+    return Estimate(result.T, windows.gain(half), half, swings)
 
 
 def _swings(residual: Array, moved: Array) -> bool:
