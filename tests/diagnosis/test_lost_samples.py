@@ -27,7 +27,7 @@ def wave(*, estimated):
     lost[5::10] = True
     shown = np.where(lost, np.r_[angle[:1], angle[:-1]], angle)
     if estimated:
-        speed = velocity(Windows(time), shown).velocity
+        speed = velocity(Windows(time), shown)[0]
     log = Log(
         name="wave",
         time=torch.from_numpy(time),

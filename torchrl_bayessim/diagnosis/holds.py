@@ -179,7 +179,6 @@ def _slope(log: Log, index: int, dof: int) -> Log:
     if not log.velocity_gain[dof]:
         return log
     speeds, gains = log.qvel.clone(), log.velocity_gain.clone()
-    windows = Windows.like(log.time.numpy(), gains.numpy())
-    slope = velocity(windows, log.qpos[:, index].numpy())
-    speeds[:, dof], gains[dof] = torch.from_numpy(slope.velocity), slope.gain
+    slope, gain, _ = velocity(Windows(log.time.numpy()), log.qpos[:, index].numpy())
+    speeds[:, dof], gains[dof] = torch.from_numpy(slope), gain
     return replace(log, qvel=speeds, velocity_gain=gains)

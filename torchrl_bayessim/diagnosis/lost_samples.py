@@ -134,8 +134,7 @@ def _interpolated(log: Log, lost: NDArray[np.bool_], coordinate: int) -> Log:
     values[:, column] = torch.from_numpy(np.where(lost & np.isfinite(between), between, kept))
     renewed = replace(log, **{name: values})
     if name == "qpos" and log.velocity_gain[column] > 0:
-        windows = Windows.like(time, log.velocity_gain.numpy())
-        estimated, _, half, _ = velocity(windows, values[:, column].numpy())
+        estimated, _, half = velocity(Windows(time), values[:, column].numpy())
         speeds, inner = log.qvel.clone(), slice(half, len(log) - half)
         speeds[inner, column] = torch.from_numpy(estimated[inner])
         renewed = replace(renewed, qvel=speeds)

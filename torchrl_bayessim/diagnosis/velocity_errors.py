@@ -45,11 +45,10 @@ def with_velocity_errors(predictor: Predictor, logs: Sequence[Log], theta: Array
         if len(positions) < _ROWS:
             continue
         rows = np.arange(len(positions), dtype=np.float64)
-        times = predictor.system.control_dt * rows
-        windows = Windows.like(times, log.velocity_gain.numpy())
+        windows = Windows(predictor.system.control_dt * rows)
         for q, v in zip(robot.qpos_index, robot.dof_index, strict=True):
             if log.velocity_gain[v] > 0:
-                slope, _, half, _ = velocity(windows, positions[:, q])
+                slope, _, half = velocity(windows, positions[:, q])
                 wrong = np.abs(slope - velocities[:, v])[half:-half]
                 error[v] = max(error[v], 1.4826 * float(np.median(wrong)))
     found = torch.from_numpy(error)

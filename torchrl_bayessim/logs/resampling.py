@@ -5,15 +5,13 @@ rotations the same in the tangent space of the first row; velocities are interpo
 action of a step is the average over it of the actions held. A record that already is on the grid,
 to within a fiftieth of a step, is taken as it is. Jumps of hinges by a turn are undone. A record is
 split where rows are left out or not finite, and at gaps, across which nothing is invented.
-Where most joints of a record swing faster than any window of its rows can follow, velocities of all
-are estimated in the narrowest (see `velocity`), which costs the fewest rows at both ends.
 """
 
 from __future__ import annotations
 
 __all__ = ["resample"]
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 
 import mujoco
 import numpy as np
@@ -26,12 +24,11 @@ from .columns import joint_names
 from .log import Log
 from .record import Record, unwrapped, usable_rows
 from .system import System
-from .velocity import Estimate, Windows, angular_velocity, velocity
+from .velocity import Windows, angular_velocity, velocity
 
 Array = NDArray[np.float64]
 _GAP = 5.0  # steps without a row after which a record is split
 _COARSEST = 10.0  # control steps that rows may usually be apart, to be interpolated
-_MOST = 0.5  # of the positions of a record
 _ROTATIONS = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
 
 
@@ -125,38 +122,23 @@ def _velocities(
     model, columns = system.task.model, system.columns
     gain = np.zeros(model.nv)
     result = np.nan_to_num(qvel)
-    needed = [
-        j
-        for j, joint in enumerate(joint_names(model))
-        if joint in columns.qpos and joint not in columns.qvel
-    ]
-    if not needed:
-        return result, gain, 0
-    if len(time) < 5:
-        return None, gain, 0
-    found = _slopes(Windows(time), qpos, model, needed)
-    if np.mean([estimate.swings for _, estimate in found]) > _MOST:
-        # the others' windows would cost rows at both ends, which the motion needs more than they
-        found = _slopes(Windows(time, narrow=True), qpos, model, needed)
-    for place, estimate in found:
-        result[:, place], gain[place] = estimate.velocity, estimate.gain
-    return result, gain, max(estimate.half_width for _, estimate in found)
-
-
-def _slopes(
-    windows: Windows, qpos: Array, model: mujoco.MjModel, joints: Sequence[int]
-) -> list[tuple[int | slice, Estimate]]:
-    """Return degrees of freedom and estimates of what they did."""
-    found: list[tuple[int | slice, Estimate]] = []
-    for j in joints:
+    margin, windows = 0, Windows(time)
+    for j, joint in enumerate(joint_names(model)):
+        if joint in columns.qvel or joint not in columns.qpos:
+            continue
+        if len(time) < 5:
+            return None, gain, 0
         q, v = model.jnt_qposadr[j], model.jnt_dofadr[j]
-        kind = int(model.jnt_type[j])
-        plain = _ROTATIONS.get(kind, 1)
-        found += [(v + i, velocity(windows, qpos[:, q + i])) for i in range(plain)]
-        if kind in _ROTATIONS:
+        plain = _ROTATIONS.get(int(model.jnt_type[j]), 1)
+        for i in range(plain):
+            result[:, v + i], gain[v + i], half = velocity(windows, qpos[:, q + i])
+            margin = max(margin, half)
+        if int(model.jnt_type[j]) in _ROTATIONS:
+            place = slice(v + plain, v + plain + 3)
             quaternions = qpos[:, q + plain : q + plain + 4]
-            found.append((slice(v + plain, v + plain + 3), angular_velocity(windows, quaternions)))
-    return found
+            result[:, place], gain[place], half = angular_velocity(windows, quaternions)
+            margin = max(margin, half)
+    return result, gain, margin
 
 
 def _interpolated(

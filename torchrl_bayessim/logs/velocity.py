@@ -13,10 +13,10 @@ and a wide window would only lose the rows at the ends: the narrowest is taken.
 
 from __future__ import annotations
 
-__all__ = ["Estimate", "Windows", "angular_velocity", "velocity"]
+__all__ = ["Windows", "angular_velocity", "velocity"]
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,25 +28,7 @@ _HALF_WIDTHS = (2, 3, 4, 6, 9, 13, 19, 28)
 _SOON = 1, 2, 3  # rows, within which no polynomial swings there and back
 _SWINGING = -0.4  # correlation of what is left with itself so soon; of noise -0.2 on average
 _WIDE = 9  # half width from which noise alone is seldom correlated so
-_AS_NARROW = 0.9  # of the gain of the narrowest window
 _MUCH = 0.1  # of a position's variance
-
-
-class Estimate(NamedTuple):
-    """A velocity from positions.
-
-    Attributes:
-        velocity: Shape ``(T,)`` or ``(T, 3)``. The first and last ``half_width`` rows are fitted
-            from one side and have larger gains.
-        gain: The median over rows, 1/s.
-        half_width: Of the window, rows.
-        swings: Whether the narrowest window was taken although a wide one predicted better.
-    """
-
-    velocity: Array
-    gain: float
-    half_width: int
-    swings: bool
 
 
 class Windows:
@@ -54,32 +36,18 @@ class Windows:
 
     Args:
         time: Increasing, shape ``(T,)``, at least 5 rows.
-        narrow: Whether to offer the narrowest window only.
     """
 
-    def __init__(self, time: Array, *, narrow: bool = False) -> None:
-        self._offered = _HALF_WIDTHS[:1] if narrow else _HALF_WIDTHS
+    def __init__(self, time: Array) -> None:
         self._time, self._step = time, np.diff(time).mean()
         self._even = bool(np.abs(np.diff(time) - self._step).max() <= 0.02 * self._step)
         self._fits: dict[int, tuple[Rows, Array, Array]] = {}
 
-    @classmethod
-    def like(cls, time: Array, gains: Array) -> Windows:
-        """Return the windows that velocities of a log were estimated in.
-
-        Args:
-            time: Of the log.
-            gains: Of its velocities, 1/s; zero where they were measured.
-        """
-        narrow = cls(time, narrow=True)
-        least = gains[gains > 0].min(initial=np.inf)
-        return narrow if np.inf > least > _AS_NARROW * narrow.gain(_HALF_WIDTHS[0]) else cls(time)
-
     @property
     def half_widths(self) -> list[int]:
         """Half widths ``h`` that leave at least as many rows outside as inside."""
-        fitting = [h for h in self._offered if 2 * h + 1 <= len(self._time) // 2]
-        return fitting or [_HALF_WIDTHS[0]]
+        fitting = [h for h in _HALF_WIDTHS if 2 * h + 1 <= len(self._time) // 2]
+        return fitting or [2]
 
     def fit(self, half: int) -> tuple[Rows, Array, Array]:
         """Return each row's window, and the weights of the value and of the slope, ``(T, w)``."""
@@ -96,29 +64,30 @@ class Windows:
             self._fits[half] = rows, smooth, slope
         return self._fits[half]
 
-    def gain(self, half: int) -> float:
-        """Return the noise of a velocity per noise of positions, 1/s, the median over rows."""
-        return float(np.median(np.linalg.norm(self.fit(half)[2], axis=1)))
 
-
-def velocity(windows: Windows, position: Array) -> Estimate:
-    """Estimate the velocity of a hinge or slide.
+def velocity(windows: Windows, position: Array) -> tuple[Array, float, int]:
+    """Return the velocity, its gain and the half width ``h`` of the window.
 
     Args:
         windows: Of the record's times.
         position: Shape ``(T,)``.
 
+    Returns:
+        Shape ``(T,)``; the median gain, 1/s; ``h``. The first and last ``h`` rows are fitted from
+        one side and have larger gains.
+
     Example:
         >>> t = np.arange(50) * 0.01
-        >>> slope = velocity(Windows(t), np.sin(3 * t)).velocity
+        >>> slope, gain, half = velocity(Windows(t), np.sin(3 * t))
         >>> bool(np.abs(slope - 3 * np.cos(3 * t)).max() < 1e-3)
         True
     """
-    return _fitted(windows, lambda rows: position[rows] - position[:, None])
+    slope, gain, half = _fitted(windows, lambda rows: position[rows] - position[:, None])
+    return slope, gain, half
 
 
-def angular_velocity(windows: Windows, quaternion: Array) -> Estimate:
-    """Estimate angular velocities in the frame of the body, shape ``(T, 3)``.
+def angular_velocity(windows: Windows, quaternion: Array) -> tuple[Array, float, int]:
+    """Return angular velocities in the frame of the body, shape ``(T, 3)``; else as `velocity`.
 
     Args:
         windows: Of the record's times.
@@ -133,7 +102,8 @@ def angular_velocity(windows: Windows, quaternion: Array) -> Estimate:
         turns = (own.inv() * other).as_rotvec().reshape(*rows.shape, 3)
         return np.moveaxis(turns, -1, 0)
 
-    return _fitted(windows, near)
+    slope, gain, half = _fitted(windows, near)
+    return slope.T, gain, half
 
 
 def _weights(offset: NDArray[Any]) -> tuple[Array, Array]:
@@ -145,7 +115,7 @@ def _weights(offset: NDArray[Any]) -> tuple[Array, Array]:
     return weights[:, 0], weights[:, 1] / scale
 
 
-def _fitted(windows: Windows, near: Callable[[Rows], Array]) -> Estimate:
+def _fitted(windows: Windows, near: Callable[[Rows], Array]) -> tuple[Array, float, int]:
     """Fit in windows of every width; ``near`` gives what neighbours differ by, ``(*, T, w)``."""
     fits = []
     for half in windows.half_widths:
@@ -154,16 +124,15 @@ def _fitted(windows: Windows, near: Callable[[Rows], Array]) -> Estimate:
         leverage = smooth[rows == np.arange(len(rows))[:, None]]
         # a row differs from itself by zero, so what is fitted there is the residual
         residual = (smooth * differences).sum(-1) / (1 - leverage)
-        fits.append((np.mean(residual**2), half, (slope * differences).sum(-1), residual))
+        fits.append((np.mean(residual**2), half, (slope * differences).sum(-1), slope, residual))
         if fits[-1][0] > 2 * min(error for error, *_ in fits):
             break  # wider windows only bend more
     best = min(error for error, *_ in fits)
-    _, half, result, residual = [fit for fit in fits if fit[0] <= 1.05 * best][-1]
+    _, half, result, slope, residual = [fit for fit in fits if fit[0] <= 1.05 * best][-1]
     first = np.zeros((residual.shape[-1], 1), dtype=np.int64)
-    swings = half >= _WIDE and _swings(residual, near(first)[..., 0])
-    if swings:
-        _, half, result, _ = fits[0]
-    return Estimate(result.T, windows.gain(half), half, swings)
+    if half >= _WIDE and _swings(residual, near(first)[..., 0]):
+        _, half, result, slope, _ = fits[0]
+    return result, float(np.median(np.linalg.norm(slope, axis=1))), half
 
 
 def _swings(residual: Array, moved: Array) -> bool:
