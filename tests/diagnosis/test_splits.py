@@ -60,22 +60,6 @@ def test_the_run_in_which_far_more_is_missing_than_in_any_other_trains():
     assert dealt_anew(parts, {**shown, **plenty}) is parts
 
 
-def test_the_only_run_in_which_much_is_missing_trains():
-    parts = split(rides())
-    left = {"train": np.ones(4), "validation": np.array([1.0, 4.0]), "test": np.ones(2)}
-    assert names(dealt_anew(parts, left)["train"])[0] == names(parts["validation"])[1]
-    left["validation"][1] = 2.0  # a run may be a little odd
-    assert dealt_anew(parts, left) is parts
-
-
-@pytest.mark.parametrize("runs", [3, 4])
-def test_of_few_runs_the_odd_one_is_not_what_parameters_are_fitted_to(runs):
-    parts = split(rides(steps=(200,) * runs, scales=(1.0,) * runs))
-    left = {name: np.ones(len(logs)) for name, logs in parts.items()}
-    left["validation"][0] = 9.0
-    assert dealt_anew(parts, left) is parts
-
-
 @pytest.mark.parametrize(
     ("train", "validation", "test"),
     [
@@ -116,17 +100,6 @@ def test_a_cause_that_shows_in_two_training_runs_only_is_found():
     assert report.effects[0].strength == pytest.approx(2.0, rel=0.1)
     assert {"run0", "run3"} & {*report.audit["train"]}
     assert {"run0", "run3"} & {*report.audit["validation"]}
-
-
-def test_a_cause_that_shows_in_one_run_only_is_found_where_that_run_trains():
-    steps = 400, 300, 230, 180, 140, 140, 140, 140
-    logs = rides(lambda t, q: -2.0 * q, steps, (0.01, 0.01, 1, *[0.01] * 5))
-    assert "run2" not in names(split(logs)["train"])
-    report = diagnose(cart(), None, logs, effects=["parallel_spring", "coulomb_friction"])
-    assert report.verdict == "named_partial"
-    assert [effect.name for effect in report.effects] == ["parallel_spring"]
-    assert report.effects[0].strength == pytest.approx(2.0, rel=0.1)
-    assert "run2" in report.audit["train"]
 
 
 @pytest.mark.parametrize("stiffness", [2.0, 8.0])

@@ -26,8 +26,6 @@ _DEAL = "train", "test", "validation", "train", "train", "test", "validation", "
 # where little shows what is missing, it is to be found before it can be tested
 _AGAIN = "train", "validation", "test", "train", "train", "validation", "test", "train"
 _SHOWS = 1.5  # mean squared innovation of a log in which something is missing
-_ODD = 2.5  # the same of a single log
-_BESIDE = 3  # logs that train when a single odd one does
 _FAR, _PLENTY = 1.5, 6.0  # times what is missing in any log that trains; what is enough to fit
 
 
@@ -95,8 +93,7 @@ def dealt_anew(
     If none of them is in a split, that split can neither teach nor judge what explains them; and if
     little is missing in those that train, and far more in another, no fit has seen the like. Then
     all are dealt anew, from the log in which most is missing to the least; pieces of logs train, as
-    ever. A single such log trains, if others do beside it. No effect has been looked for when this
-    is decided.
+    ever. No effect has been looked for when this is decided.
 
     Args:
         parts: The logs of each split.
@@ -122,11 +119,9 @@ def _dealt(logs: Sequence[Log], names: Sequence[str] = _DEAL) -> dict[str, list[
 
 
 def _lopsided(left: Mapping[str, Array]) -> bool:
-    """Return whether what shows in logs is not in each split, or hardly in training."""
-    most = {name: float(errors.max(initial=1.0)) - 1.0 for name, errors in left.items()}
+    """Return whether what shows in several logs is not in each split, or hardly in training."""
     if sum(int((errors > _SHOWS).sum()) for errors in left.values()) < 2:
-        enough = len(left["train"]) >= _BESIDE  # parameters are not to be fitted to it alone
-        elsewhere = most["train"] < max(most.values())
-        return enough and elsewhere and max(most.values()) > _ODD - 1.0
+        return False
+    most = {name: float(errors.max(initial=1.0)) - 1.0 for name, errors in left.items()}
     far = max(most.values()) > _FAR * most["train"] and most["train"] < _PLENTY
     return far or min(most.values()) < _SHOWS - 1.0
