@@ -186,9 +186,8 @@ def shown_by_the_fit(base: Model, model: Model) -> bool:
     may have been in one run; a law that is not it would leave some of what it does, where that is
     more than a segment.
     """
-    before, after = (m.fit.innovations**2 for m in (base, model))
-    gains = (before - after).sum(-1)
-    gone = before.mean() > WHITE > max(float(after.mean()), model.dispersion())
+    gains = (base.deviances() - model.deviances())[: len(model.fit.innovations)]
+    gone = base.fit.mean_square > WHITE > max(model.fit.mean_square, model.dispersion())
     return bool(gone and gains.sum() - gains.max() > _BESIDE and gain(base, model) > -LIKELY)
 
 

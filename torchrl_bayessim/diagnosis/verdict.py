@@ -193,9 +193,8 @@ class _Weighed:
         surely = min((e.p_value for e in effects), default=1.0) < _CERTAIN
         by_chance = bool(scattered) and (surely or measured.refit > SHOWN)
         together = p_value < _DOUBTLESS and shown_together(selection.nominal, selection.best)
-        fitted = certain and shown_by_the_fit(selection.nominal, selection.best)
-        together |= fitted and measured.refit < SHOWN
-        together |= bool(scattered) and surely and measured.refit < SHOWN
+        alone = certain and shown_by_the_fit(selection.nominal, selection.best)
+        together |= (alone or (bool(scattered) and surely)) and measured.refit < SHOWN
         together &= measured.effects < _NO_WORSE * measured.refit and not guessed
         perhaps_nothing = measured.explained_ci[0] <= 0 and validated < PARTIAL and not by_chance
         unsaid = measured.explained < PARTIAL or perhaps_nothing
