@@ -3,7 +3,7 @@
 import pytest
 from plain_models import Unit
 
-from torchrl_bayessim.diagnosis.found import _is_stopgap, _together
+from torchrl_bayessim.diagnosis.found import _is_stopgap, _matter_beside, _together
 from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
 
 HIP, KNEE, HARDER = Unit("friction", "hip"), Unit("friction", "knee"), Unit("friction", "hip", 2.0)
@@ -37,3 +37,18 @@ def test_what_explains_little_of_held_samples_is_a_cause_if_it_is_most_of_the_re
 ):
     left = Shrinkage(refit, refit, effects, 0.5, (0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
     assert _is_stopgap(left, 614.0) == stopgap
+
+
+@pytest.mark.parametrize(
+    ("recorded", "effects", "matter"),
+    [
+        (1.52, 0.93, True),
+        (1.02, 0.93, False),  # noise, as it was recorded
+        (3.0, 2.8, False),  # something else is most of what is left
+    ],
+)
+def test_held_samples_beside_a_large_gap_are_told_if_they_are_most_of_what_effects_leave(
+    recorded, effects, matter
+):
+    left = Shrinkage(440.0, 440.0, effects, 0.5, (0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
+    assert _matter_beside(left, recorded) == matter

@@ -38,7 +38,7 @@ def test_most_held_samples_of_a_moving_joint_are_found_and_put_right(share, gain
         data.append((angle, gain * speed, lost, shown(angle, lost, rng)))
     found = held_in_noise([one[3] for one in data], [one[1] for one in data], DT)
     assert abs(found.share - share) < 3 * np.sqrt(share / found.count)
-    assert found.gain == pytest.approx(1 / gain, rel=0.02)
+    assert found.gain == pytest.approx(1 / gain, rel=0.005)
     for (angle, speed, lost, seen), rows in zip(data, found.rows, strict=True):
         moving = np.abs(speed) > 1.0 * abs(gain)
         assert (rows != lost)[moving].mean() < 0.02
@@ -114,6 +114,19 @@ def twice_and_at_rest(log, rows, rng):
         qvel=torch.cat([log.qvel, 0.02 * torch.randn(rows, 1, generator=GENERATOR).double()]),
         ctrl=torch.cat([log.ctrl, torch.zeros(rows, 1).double()]),
     )
+
+
+def test_a_few_are_named_beside_an_effect_that_does_a_hundred_times_as_much():
+    rng = np.random.default_rng(6)
+    data = logs(8, push=lambda q, v: 0.3)
+    data = [shown_again(log, 0.04, rng) for log in data]
+    some = ("constant_force", "viscous_friction", "sensor_dropout", "sensor_delay", "action_lag")
+    report = diagnose(system(), None, data, effects=some)
+    found = {effect.name: effect for effect in report.effects}
+    assert set(found) == {"constant_force", "sensor_dropout"}
+    assert found["constant_force"].strength == pytest.approx(0.3, rel=0.05)
+    assert found["sensor_dropout"].strength == pytest.approx(0.04, rel=0.5)
+    assert found["sensor_dropout"].share_of_gap < 0.01
 
 
 def test_friction_is_found_beside_them():

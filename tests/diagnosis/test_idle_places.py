@@ -9,7 +9,7 @@ from plain_models import A, B, C, Unit, plain
 
 from torchrl_bayessim.diagnosis.alternatives import exchanged
 from torchrl_bayessim.diagnosis.credit import worthwhile
-from torchrl_bayessim.diagnosis.elimination import _idle_place, _without_doubt
+from torchrl_bayessim.diagnosis.elimination import _idle_place, _one_event, _without_doubt
 from torchrl_bayessim.diagnosis.model import Model
 from torchrl_bayessim.diagnosis.selection import Selection
 
@@ -49,6 +49,26 @@ def test_what_the_runs_that_judge_never_excite_is_needed_by_the_runs_of_the_fit(
     of_logs = np.r_[np.arange(20) % logs, np.full(20, logs)]
     best, smaller = (replace(m, logs=of_logs) for m in (best, smaller))
     assert _without_doubt(smaller, best) == needed
+
+
+@pytest.mark.parametrize(
+    ("event", "left", "judged", "needed"),
+    [
+        (4000.0, 1.0, 1.0, True),
+        (900.0, 1.0, 1.0, False),  # many a law would
+        (4000.0, 1.3, 1.0, False),  # not down to noise
+        (4000.0, 1.0, 1.1, False),  # it does not hold up
+    ],
+)
+def test_what_is_met_once_is_needed_by_the_run_in_which_it_was_met(event, left, judged, needed):
+    """A speed limit, where the robot was once as fast."""
+    slow, best = plain([A], 400.0), plain([A, C], 400.0 * left)
+    slow = replace(slow, validation=best.validation)
+    once = slow.fit.innovations.copy()
+    once[3] = np.sqrt(event / once.shape[1])
+    smaller = replace(slow, fit=replace(slow.fit, innovations=once))
+    best = replace(best, validation=np.sqrt(judged) * best.validation)
+    assert _one_event(smaller, best) == needed
 
 
 @pytest.mark.parametrize(

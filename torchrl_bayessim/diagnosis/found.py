@@ -27,7 +27,7 @@ from .validation import NEGLIGIBLE
 _WORTH = 0.01  # of the gap on test runs, to name chance beside another cause
 _CERTAIN = 100.0  # deviance on training and validation runs, to be named for less
 _REST = 0.25  # of what effects leave
-_LEFT, _MOST_OF_IT = 1.5, 0.5  # of the noise, what bridges leave; what is no stopgap takes of that
+_LEFT, _MOST_OF_IT = 1.5, 0.4  # of the noise, what bridges leave; what is no stopgap takes of that
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,8 @@ def _with_holds(found: Found, scatter: Scatter) -> Found:
     """
     measured, before = scatter.with_holds(found.measured), found.measured
     gap = max(measured.refit - 1.0, 1e-9)
-    if measured.refit - before.refit <= _WORTH * gap:
+    small = measured.refit - before.refit <= _WORTH * gap
+    if small and not _matter_beside(before, scatter.recorded[1]):
         return found
     if _is_stopgap(before, gap):
         found = replace(found, effects=(), strengths={}, confused=())
@@ -139,6 +140,17 @@ def _with_holds(found: Found, scatter: Scatter) -> Found:
     (held,) = scatter.held_findings(measured, sum(e.share_of_gap for e in lasting))
     known = {**found.strengths, SensorDropout(): dict(held.strengths)}
     return _ranked(found, measured, [*lasting, held], known)
+
+
+def _matter_beside(bridged: Shrinkage, recorded: float) -> bool:
+    """Return whether samples that are held are most of what effects leave of a large gap.
+
+    Args:
+        bridged: How far the gap shrinks of samples with bridges in the places of those held.
+        recorded: What the effects leave of samples as they were recorded.
+    """
+    left = recorded - 1.0
+    return left > NEGLIGIBLE - 1.0 and recorded - bridged.effects > _MOST_OF_IT * left
 
 
 def _is_stopgap(bridged: Shrinkage, gap: float) -> bool:

@@ -92,7 +92,7 @@ def held_in_noise(
         return None
     told = [held[1:][some[: len(held) - 1]] for held, some in zip(rows, moving, strict=True)]
     held = np.concatenate(told)
-    return HeldSamples(rows, float(held.mean()), len(held), model.gain)
+    return HeldSamples(rows, float(held.mean()), len(held), model.gain_between(rows, values, scale))
 
 
 def with_motion(values: Array, speeds: Array, held: Held, time: Array) -> Array:
@@ -172,6 +172,19 @@ class _Model:
                 on = state[..., :-1] + held + np.log(shares)
             state = np.where(self._now(k), np.concatenate([first, on], -1), state)
         return np.asarray(-2 * logsumexp(state, axis=-1).sum(-1), dtype=np.float64)
+
+    def gain_between(self, rows: Sequence[Held], values: Sequence[Array], scale: float) -> float:
+        """Return how far positions go per velocity from one renewed sample to the next.
+
+        Least squares, without outliers: held samples take part in the median, which is a guess.
+        """
+        gone = [one[: len(held)][~held] for one, held in zip(self.gone, rows, strict=True)]
+        moved = np.concatenate([np.diff(one) for one in gone]) / self.gain
+        went = [np.diff(one[~held]) for one, held in zip(values, rows, strict=True)]
+        changes = np.concatenate(went)
+        near = np.abs(changes - self.gain * moved) < _MOVING * scale
+        square = float((moved[near] ** 2).sum())
+        return float((moved[near] * changes[near]).sum()) / square if square else self.gain
 
     def likeliest(self, scale: float, share: float) -> list[Held]:
         """Return which samples are held in the likeliest sequence (Viterbi 1967)."""

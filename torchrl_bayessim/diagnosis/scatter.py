@@ -27,21 +27,29 @@ from .shrinkage import Shrinkage
 from .splits import split
 
 _DRAWS = 1000
+_NOTHING = 1.0, 1.0  # noise alone
 
 
-def gap_with_holds(prepared: Prepared, logs: Sequence[Log], selection: Selection) -> float:
-    """Return the mean squared innovation of test segments cut from the logs as recorded."""
+def gap_with_holds(
+    prepared: Prepared, logs: Sequence[Log], selection: Selection
+) -> tuple[float, float]:
+    """Return mean squared innovations of test segments cut from the logs as recorded.
+
+    Without effects, and with those that were found.
+    """
     test = prepared.sets["test"]
     if test.segments.uncertainty is not None:  # the held samples entered the estimates too
-        return 1.0
+        return _NOTHING
     whole, size = split(logs)["test"], len(test.segments)
     if test.segments.touching is not None:
         theta = test.theta(selection.nominal.fit.point.z)
         whole = settled(prepared.predictor, whole, theta=theta, noise=prepared.noise)
     pieces = prepared.mode.cut(whole, prepared.horizon, history=test.segments.history, most=size)
     if len(pieces) != size:
-        return 1.0
-    return float(_along(test, pieces, [selection.nominal.fit.point])[0])
+        return _NOTHING
+    models = selection.nominal, selection.best
+    without, beside = _along(test, pieces, [model.fit.point for model in models]).tolist()
+    return without, beside
 
 
 def _along(test: Objective, pieces: Segments, points: Sequence[Point]) -> NDArray[np.float64]:
@@ -144,8 +152,8 @@ class Scatter:
         found: Those that explain the scatter, the likeliest first.
         least: Of each that was looked for, the least strength that would have been seen.
         holds: Channels whose samples were not always renewed.
-        recorded: Mean squared innovation of test segments with samples as they were recorded, 1
-            where what was compared is that.
+        recorded: Mean squared innovations of test segments with samples as they were recorded,
+            without effects and with those that last; 1 where what was compared is that.
         hidden: Names of those that what was found to be late may be in truth.
         sent: Of the commands that were sent, where others are taken to have arrived.
     """
@@ -153,7 +161,7 @@ class Scatter:
     found: Sequence[Chance]
     least: Mapping[Unit, float]
     holds: Sequence[Hold]
-    recorded: float
+    recorded: tuple[float, float]
     hidden: Sequence[str] = ()
     sent: Sent | None = None
 
@@ -207,7 +215,7 @@ class Scatter:
 
     def with_holds(self, before: Shrinkage) -> Shrinkage:
         """Return how far the gap of the samples as they were recorded shrinks."""
-        refit = max(self.recorded, before.refit)
+        refit = max(self.recorded[0], before.refit)
         return self._from(before, max(before.raw, refit), refit)
 
     def with_arrivals(self, before: Shrinkage, sent: Sent) -> Shrinkage:

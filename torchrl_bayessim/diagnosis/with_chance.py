@@ -58,7 +58,7 @@ def with_chance(
     """
     random, suspects = of_chance(units), Suspects.of(prepared, selection, units)
     found = losses(prepared, selection, suspects) if suspects else []
-    sent, shaken, recorded = None, None, 1.0
+    sent, shaken, recorded = None, None, (1.0, 1.0)
     seen = replace(prepared, alarms=alarms)
     if holds:
         recorded = gap_with_holds(prepared, logs, selection)
