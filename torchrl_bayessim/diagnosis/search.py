@@ -24,7 +24,7 @@ from .form_fit import softened, with_fitted_forms, with_forms_anew
 from .free_numbers import priced
 from .further_effects import identified, no_rival, nothing_left, stands_apart
 from .little_left import all_of_little, little_left, one_alone
-from .model import WHITE, Model, criterion, judged, judged_fits
+from .model import WHITE, Model, best_by_effect, criterion, judged, judged_fits, shown
 from .objective import Objective, Point, Unit
 from .refit import Fit, refit
 from .rounded_commands import rounded
@@ -37,6 +37,7 @@ _MOST = 4  # effects in one explanation
 _HALF = 0.5  # of what is left
 _LESS, _FORMS = 0.05, 3  # of what is explained; models that explain all but that
 _MUCH = 5.0  # mean squared innovation: a law that is stuck where it began may leave as much
+_ROUGH, _BEGINNINGS = 2.0, 5  # mean squared innovation of what two may explain; others tried
 _UNSEEN = 1.0  # a deviance, in units of the dispersion, that no test can detect
 
 
@@ -98,6 +99,31 @@ class Search:
             if enough or len(best.names) == len(found.names):
                 break
         return best
+
+    def or_two_others(self, best: Model) -> Model:
+        """Return the model, or one of two effects that leave noise alone where its own does not.
+
+        The effect that explains most alone may be neither of them: a spring beside a heavier rotor
+        is nearly a payload. So what explains less alone is gone on from, too.
+        """
+        if self.varied or not best.units or best.mean_square < _ROUGH:
+            return best
+        first = set(list(best.names)[:1])
+        others = [m for m in self.tried if len(m.names) == 1 and m.names != first]
+        begun = list(best_by_effect(others, self.start).values())[:_BEGINNINGS]
+        found = [two for two in map(self._two, begun) if two is not None and shown(best, two)]
+        return min(found, key=lambda two: criterion(two, 1.0), default=best)
+
+    def _two(self, one: Model) -> Model | None:
+        """Return a model of an effect and a second one, if they leave noise alone."""
+        self.progress(f"searching on from {next(iter(one.names))}")
+        left = [unit for unit in with_forms_of(self.units, one) if unit not in one.units]
+        now = compare(self.sets[0], one.fit, left)
+        better = lambda models: self._better(one, models, seen=now.seen)
+        two = self._explained(now, lambda models: better([m for m in models if len(m.names) == 2]))
+        two = None if two is None else self._needs(two)
+        white = two is not None and len(two.names) == 2 and two.mean_square < WHITE
+        return two if white else None
 
     def _further(self, best: Model) -> Model | None:
         """Return the model with what it lacks most; nothing where it lacks nothing."""

@@ -112,15 +112,21 @@ def select(
         again=again, varied=varied,
         shapes=shapes, alpha=alpha, generator=generator, progress=progress,
     )  # fmt: skip
-    needs = search.best()
-    instead = partial(
-        alternatives, train, validation,
-        units=with_forms_of(search.units, needs), first=search.screens[0], offered=units,
-    )  # fmt: skip
-    best, others = _settled(
-        train, validation, needs, instead,
-        tried=search.tried, offered=units, progress=progress,
-    )  # fmt: skip
+
+    def settled(needs: Model) -> tuple[Model, dict[str, tuple[Model, ...]]]:
+        instead = partial(
+            alternatives, train, validation,
+            units=with_forms_of(search.units, needs), first=search.screens[0], offered=units,
+        )  # fmt: skip
+        return _settled(
+            train, validation, needs, instead,
+            tried=search.tried, offered=units, progress=progress,
+        )  # fmt: skip
+
+    best, others = settled(search.best())
+    two = search.or_two_others(best)
+    if two is not best:
+        best, others = settled(two)
     found = tuple(search.screens), tuple(search.p_values), tuple(search.tried), others
     return Selection(start, best, *found, offered=tuple(units))
 
