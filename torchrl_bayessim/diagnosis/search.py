@@ -85,9 +85,13 @@ class Search:
         self.units: Sequence[Unit] = offered
         self.tried, self.screens, self.p_values = [start], list[Screen](), list[float]()
 
-    def best(self) -> Model:
-        """Return what the data need: what is found beside less than a round had counts too."""
-        best = self.start
+    def best(self, found: Model | None = None) -> Model:
+        """Return what the data need: what is found beside less than a round had counts too.
+
+        Args:
+            found: To go on from; default the parameters alone.
+        """
+        best = found or self.start
         for rounds in range(1, _MOST + 1):
             further = self._further(best)
             found = further or best
@@ -106,7 +110,8 @@ class Search:
         The effect that explains most alone may be neither of them: a spring beside a heavier rotor
         is nearly a payload. So what explains less alone is gone on from, too.
         """
-        if self.varied or not best.units or best.mean_square < _ROUGH:
+        rough = _ROUGH if len(best.names) == 1 else WHITE  # a law may have another form
+        if self.varied or not best.units or best.mean_square < rough:
             return best
         first = set(list(best.names)[:1])
         others = [m for m in self.tried if len(m.names) == 1 and m.names != first]

@@ -126,7 +126,7 @@ def select(
     best, others = settled(search.best())
     two = search.or_two_others(best)
     if two is not best:
-        best, others = settled(two)
+        best, others = settled(search.best(two))
     found = tuple(search.screens), tuple(search.p_values), tuple(search.tried), others
     return Selection(start, best, *found, offered=tuple(units))
 
