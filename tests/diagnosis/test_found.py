@@ -3,7 +3,8 @@
 import pytest
 from plain_models import Unit
 
-from torchrl_bayessim.diagnosis.found import _is_stopgap, _matter_beside, _together
+from torchrl_bayessim.diagnosis.found import _is_stopgap, _together
+from torchrl_bayessim.diagnosis.scatter import Recorded
 from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
 
 HIP, KNEE, HARDER = Unit("friction", "hip"), Unit("friction", "knee"), Unit("friction", "hip", 2.0)
@@ -28,6 +29,7 @@ def test_a_strength_is_the_mean_of_places_and_the_sum_at_each(units, expected):
     [
         (6.7, 2.3, False),  # a gap in a drive, beside a sensor that repeats itself
         (6.7, 4.5, True),
+        (1.94, 1.51, False),  # a sensor's gain
         (1.3, 1.0, True),  # what straight lines leave
         (90.0, 80.0, False),  # more than a hundredth of all
     ],
@@ -40,15 +42,14 @@ def test_what_explains_little_of_held_samples_is_a_cause_if_it_is_most_of_the_re
 
 
 @pytest.mark.parametrize(
-    ("recorded", "effects", "matter"),
+    ("effects", "bridged", "matter"),
     [
         (1.52, 0.93, True),
         (1.02, 0.93, False),  # noise, as it was recorded
         (3.0, 2.8, False),  # something else is most of what is left
     ],
 )
-def test_held_samples_beside_a_large_gap_are_told_if_they_are_most_of_what_effects_leave(
-    recorded, effects, matter
+def test_held_samples_beside_a_large_gap_matter_if_they_are_most_of_what_effects_leave(
+    effects, bridged, matter
 ):
-    left = Shrinkage(440.0, 440.0, effects, 0.5, (0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
-    assert _matter_beside(left, recorded) == matter
+    assert Recorded(445.0, effects, bridged).matter == matter

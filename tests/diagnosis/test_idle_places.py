@@ -51,22 +51,30 @@ def test_what_the_runs_that_judge_never_excite_is_needed_by_the_runs_of_the_fit(
     assert _without_doubt(smaller, best) == needed
 
 
+def met(model, deviance):
+    """Return the model with such a deviance in one segment of the fit."""
+    left = model.fit.innovations.copy()
+    left[7] = np.sqrt(deviance / left.shape[1])
+    return replace(model, fit=replace(model.fit, innovations=left))
+
+
 @pytest.mark.parametrize(
-    ("event", "left", "judged", "needed"),
+    ("once", "left", "judged", "needed"),
     [
-        (4000.0, 1.0, 1.0, True),
-        (900.0, 1.0, 1.0, False),  # many a law would
-        (4000.0, 1.3, 1.0, False),  # not down to noise
-        (4000.0, 1.0, 1.1, False),  # it does not hold up
+        ((4000.0, 10.0), 1.0, 1.0, True),
+        ((900.0, 10.0), 1.0, 1.0, False),  # many a law would
+        ((4000.0, 16.0), 1.0, 1.0, False),  # it is not quite what happened
+        ((1100.0, 14.0), 1.0, 1.0, True),
+        ((4000.0, 10.0), 1.3, 1.0, False),  # more than noise is left elsewhere
+        ((4000.0, 10.0), 1.0, 1.1, False),  # it does not hold up
+        ((4000.0, 10.0), 1.0, 1.02, True),
     ],
 )
-def test_what_is_met_once_is_needed_by_the_run_in_which_it_was_met(event, left, judged, needed):
+def test_what_is_met_once_is_needed_by_the_run_in_which_it_was_met(once, left, judged, needed):
     """A speed limit, where the robot was once as fast."""
     slow, best = plain([A], 400.0), plain([A, C], 400.0 * left)
     slow = replace(slow, validation=best.validation)
-    once = slow.fit.innovations.copy()
-    once[3] = np.sqrt(event / once.shape[1])
-    smaller = replace(slow, fit=replace(slow.fit, innovations=once))
+    smaller, best = (met(m, there) for m, there in zip((slow, best), once, strict=True))
     best = replace(best, validation=np.sqrt(judged) * best.validation)
     assert _one_event(smaller, best) == needed
 

@@ -336,6 +336,20 @@ def test_chance_beside_effects_has_to_matter(gain, before, after, matters):
 
 
 @pytest.mark.parametrize(
+    ("before", "after", "matters"), [(4.6, 1.03, True), (4.6, 3.6, False), (1.4, 1.0, False)]
+)
+def test_chance_that_takes_most_of_what_a_large_gaps_effects_leave_matters(before, after, matters):
+    """Though it is less than a hundredth of the gap, and not certain."""
+
+    def left(effects):
+        explained = (637.0 - effects) / 636.0
+        return Shrinkage(3e3, 637.0, effects, explained, (0.9, 1.0), (8.0, 10.0), (0.0, 1.0))
+
+    scatter = SimpleNamespace(found=[SimpleNamespace(gain=81.0)])
+    assert found_matters(scatter, left(before), left(after)) == matters
+
+
+@pytest.mark.parametrize(
     ("gains", "kept"),
     [
         ({"one": 200.0, "two": 60.0, "all": 90.0}, 3),

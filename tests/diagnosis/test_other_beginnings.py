@@ -1,13 +1,16 @@
 """Two causes that a third law imitates alone, so that a search begins with neither."""
 
+from types import SimpleNamespace
+
 import pytest
 from plain_models import A, C, Unit, plain
 from test_diagnose import ARM, logs, system
 from test_search import Scripted
 
+from torchrl_bayessim.diagnosis import search as searching
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 
-SPRING, ROTOR, PAYLOAD = Unit("spring"), Unit("rotor"), Unit("payload")
+SPRING, ROTOR, PAYLOAD, WAVE = (Unit(n) for n in ("spring", "rotor", "payload", "wave"))
 
 
 def test_a_spring_beside_a_heavier_rotor_is_no_payload():
@@ -32,33 +35,102 @@ class Begun(Scripted):
     def __init__(self, best, beside):
         super().__init__({}, {})
         self.tried = [best, *(plain([unit], 1e5 + i) for i, unit in enumerate(beside))]
-        self.varied, self.beside, self.begun = False, beside, []
+        self.again, self.offered, self.units = None, [SPRING], [PAYLOAD]
+        self.beside, self.begun = beside, []
 
     def _two(self, one):
         self.begun.append(one.units[0])
-        return self.beside[one.units[0]]
+        two = self.beside[one.units[0]]
+        self.tried.append(two)
+        return two
 
 
 @pytest.mark.parametrize(
-    ("best", "left", "others"),
+    ("best", "left", "taken"),
     [
-        ([PAYLOAD], 900.0, 2),
-        ([PAYLOAD], 700.0, 0),  # a law in another form may leave as much
-        ([PAYLOAD, C], 700.0, 2),
-        ([PAYLOAD, C], 450.0, 0),
-        ([], 900.0, 0),
+        ([PAYLOAD], 900.0, True),
+        ([PAYLOAD], 700.0, False),  # a law in another form may leave as much
+        ([PAYLOAD, C], 700.0, True),
+        ([PAYLOAD, C], 450.0, False),
+        ([], 900.0, False),
     ],
 )
-def test_where_more_than_noise_is_left_a_search_goes_on_from_what_explains_less(best, left, others):
-    two = plain([SPRING, ROTOR], 410.0)
-    before = plain(best, left)
-    search = Begun(before, {PAYLOAD: plain([PAYLOAD, A], 405.0), SPRING: None, ROTOR: two})
-    assert search.or_two_others(before) is (two if others else before)
-    assert search.begun == [SPRING, ROTOR][:others]
+def test_where_more_than_noise_is_left_a_search_goes_on_from_what_explains_less(best, left, taken):
+    two, before = plain([SPRING, ROTOR], 410.0), plain(best, left)
+    beside = {
+        PAYLOAD: plain([PAYLOAD, A], 405.0),
+        SPRING: None,
+        ROTOR: two,
+        A: plain([A, C], 430.0),
+    }
+    search = Begun(before, beside)
+    assert search.or_two_others(before) is (two if taken else before)
+    assert search.begun == [SPRING, ROTOR, A][: 3 * taken]
+    assert search.units == ([SPRING] if taken else [PAYLOAD])
 
 
-def test_nothing_else_is_looked_for_where_what_varies_counts_as_noise():
-    before = plain([PAYLOAD], 900.0)
-    search = Begun(before, {ROTOR: plain([SPRING, ROTOR], 410.0)})
-    search.varied = True
+@pytest.mark.parametrize("others", [[plain([SPRING, ROTOR], 470.0)], [
+    plain([SPRING, ROTOR], 410.0), plain([A, C], 411.0),
+]])  # fmt: skip
+def test_two_that_explain_little_more_or_two_pairs_that_do_are_not_taken(others):
+    before = plain([PAYLOAD, WAVE], 485.0)
+    search = Begun(before, dict(zip((ROTOR, A), others, strict=False)))
+    tried = list(search.tried)
     assert search.or_two_others(before) is before
+    assert search.begun
+    assert search.tried == tried
+
+
+def test_no_more_than_so_many_are_begun_from_in_a_search_of_few_effects_that_began_anew():
+    before, kinds = plain([PAYLOAD], 900.0), [Unit(f"law {i}") for i in range(9)]
+    search = Begun(before, dict.fromkeys(kinds))
+    assert search.or_two_others(before) is before
+    assert search.begun == kinds[:5]
+    search = Begun(before, dict.fromkeys(kinds))
+    search.again = list
+    assert search.or_two_others(before) is before
+    search.again, search.offered = None, [SPRING] * 151
+    assert search.or_two_others(before) is before
+    assert not search.begun
+
+
+@pytest.mark.parametrize(
+    ("found", "needs", "kept"),
+    [
+        (plain([ROTOR, SPRING], 410.0), None, True),
+        (plain([ROTOR, SPRING], 500.0), None, False),
+        (plain([ROTOR, SPRING], 410.0), plain([SPRING], 411.0), False),
+        (None, None, False),
+    ],
+)
+def test_two_have_to_leave_noise_alone_and_need_each_other(monkeypatch, found, needs, kept):
+    one, pair, three = (plain(units, 420.0) for units in (
+        [ROTOR], [ROTOR, SPRING], [ROTOR, SPRING, WAVE],
+    ))  # fmt: skip
+    given = []
+
+    def explained(now, best_of):
+        best_of([one, pair, three])
+        return found
+
+    search = Scripted({}, {} if needs is None else {found.units: needs})
+    search.sets, search.offered = ("train", "judge"), [ROTOR, SPRING]
+    search.progress, search.shapes = (lambda _: None), (lambda _: [])
+    search._explained = explained
+    search._better = lambda base, models, seen: given.extend(models)
+    monkeypatch.setattr(searching, "refit", lambda _, points, iterations: [one.fit])
+    monkeypatch.setattr(searching, "with_forms_of", lambda units, _: units)
+    monkeypatch.setattr(searching, "with_shapes", lambda units, _: units)
+    monkeypatch.setattr(searching, "compare", lambda _, fit, units: SimpleNamespace(seen=units))
+    assert search._two(one) is (found if kept else None)
+    assert given == [pair]
+
+
+def test_a_search_that_goes_on_from_two_has_as_many_rounds_less():
+    names = [Unit(f"law {i}") for i in range(9)]
+    further = {
+        tuple(names[:count]): plain(names[: count + 1], 1e5 / (1 + count)) for count in range(8)
+    }
+    search = Scripted(further, {})
+    assert len(search.best().names) == 4
+    assert len(search.best(further[names[0],]).names) == 4

@@ -51,7 +51,7 @@ CALM = 1.3  # φ beyond which an effect of chance has not explained the scatter
 _SEGMENTS = 8  # of each split
 _APART = 4  # targets of one effect that are looked at singly
 _LEAST = 0.3  # relative error of a strength: so few draws do not span what chance may do
-_NEEDED = 20.0  # deviance, to be found
+_NEEDED, _NEEDED_BESIDE = 20.0, 40.0  # deviance, to be found
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,11 @@ def detectable(train: Objective, selection: Selection, units: Sequence[Unit]) ->
 
 
 def chances(
-    sets: Mapping[str, Objective], selection: Selection, units: Sequence[Unit]
+    sets: Mapping[str, Objective],
+    selection: Selection,
+    units: Sequence[Unit],
+    *,
+    beside: bool = False,
 ) -> list[Chance]:
     """Return the random effects that explain what the best model leaves, the likeliest first.
 
@@ -124,15 +128,18 @@ def chances(
         sets: Training, validation and test segments.
         selection: What the search without chance found.
         units: Random effects at their targets.
+        beside: Whether they act beside the effects that were found, not in their place. A law that
+            is not quite the true one leaves errors that scatter, too, so that takes more.
     """
-    if not units or calm(selection):
+    if not units or calm(selection) or (beside and not selection.best.units):
         return []
-    point = selection.nominal.fit.point
+    needed = _NEEDED_BESIDE if beside else _NEEDED
+    point = (selection.best if beside else selection.nominal).fit.point
     judged = [Judged.of(sets[name], point, _SEGMENTS) for name in ("train", "validation")]
     base = deviances_without(judged, selection.best.fit.point)
     best = _likeliest(judged, point, [(u, level * u.high) for u in units for level in _LEVELS])
     least = min(cost for cost, _ in best.values())
-    if base.sum() - least < _NEEDED:
+    if base.sum() - least < needed:
         return []
     found = [
         _refined(judged, sets["test"], unit, strength, point=point, base=base)
@@ -141,7 +148,7 @@ def chances(
     ]
     found = [chance for chance in found if chance is not None]
     most = max((chance.gain for chance in found), default=0.0)
-    found = [c for c in found if c.gain > max(_NEEDED, most - LIKELY)]
+    found = [c for c in found if c.gain > max(needed, most - LIKELY)]
     return sorted(found, key=lambda c: -c.gain)
 
 
@@ -171,7 +178,7 @@ def _likeliest(
     judged: Sequence[Judged], point: Point, rows: Sequence[tuple[Unit, float]]
 ) -> dict[Unit, tuple[float, float]]:
     """Return the least deviance of each unit over strengths, and the strength that has it."""
-    told = _told(judged, [Point(point.z, {unit: strength}) for unit, strength in rows])
+    told = _told(judged, [_with(point, unit, strength) for unit, strength in rows])
     best: dict[Unit, tuple[float, float]] = {}
     for (unit, strength), one in zip(rows, told, strict=True):
         best[unit] = min(best.get(unit, (np.inf, 0.0)), (one.cost, strength))
@@ -225,7 +232,7 @@ def _refined(
     """
     strengths = np.array([1.0, *_AROUND]) * strength
     strengths = np.unique(np.minimum(strengths, unit.high))
-    points = [Point(point.z, {unit: float(s)}) for s in strengths]
+    points = [_with(point, unit, float(s)) for s in strengths]
     told = _told(judged, points)
     costs = np.array([one.cost for one in told])
     best = int(np.argmin(costs))
@@ -241,7 +248,13 @@ def _refined(
         error=_error(np.log(strengths), costs) * float(strengths[best]),
         gain=float(gains.sum()),
         left=after,
+        before=float((unseen.left**2).mean()) if point.strengths else None,
+        beside=bool(point.strengths),
     )
+
+
+def _with(point: Point, unit: Unit, strength: float) -> Point:
+    return Point(point.z, {**point.strengths, unit: strength})
 
 
 def _error(logs: Array, costs: Array) -> float:

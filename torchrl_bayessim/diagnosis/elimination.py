@@ -26,7 +26,6 @@ from .model import (
     judged,
     judged_fits,
     shown,
-    shown_by_the_fit,
 )
 from .objective import Objective, Point, Unit
 from .refit import refit
@@ -35,6 +34,7 @@ _IDLE = 1e-3  # of the deviance that an effect explains at another place
 # deviance without an effect per that with it, that of a segment, and that with it, where judged
 _TIMES, _PLAIN, _WORSE = 10.0, 40.0, 1.5
 _EVENT = 1000.0  # deviance that a segment has of what happens once
+_NOISY = 1.5  # times what noise leaves of a segment
 _APART = 3  # effects without each of which a model is fitted with derivatives of its own
 
 
@@ -47,10 +47,7 @@ def eliminated(train: Objective, validation: Objective, model: Model) -> tuple[M
         criteria = [criterion(m, model.dispersion()) for m in smaller]
         best = int(np.argmin(criteria))
         worse = criteria[best] > criterion(model, model.dispersion())
-        needs = any(
-            needed(smaller[best], model)
-            for needed in (shown, shown_by_the_fit, _without_doubt, _one_event)
-        )
+        needs = any(speaks(smaller[best], model) for speaks in (shown, _without_doubt, _one_event))
         if worse and needs:
             idle = _idle_place(model, smaller)
             if idle is None:
@@ -74,15 +71,16 @@ def _without_doubt(smaller: Model, model: Model) -> bool:
 
 
 def _one_event(smaller: Model, model: Model) -> bool:
-    """Return whether a unit brings the one segment that was far from noise down to it.
+    """Return whether a unit brings down to noise a segment that is far from it without.
 
     A speed limit may be met once in all runs. A law that is not the true one would not follow what
     that does there from step to step, where it is ever so much more than noise.
     """
     mine, others = ((m.fit.innovations**2).sum(-1) for m in (model, smaller))
     once = int((others - mine).argmax())
-    large = others[once] - mine[once] > _EVENT and others[once] > _TIMES * mine[once]
-    return bool(large and model.mean_square < WHITE and gain(smaller, model) > -LIKELY)
+    far = others[once] - mine[once] > _EVENT and others[once] > _TIMES * mine[once]
+    noise = mine[once] < _NOISY * model.fit.innovations.shape[1] and model.mean_square < WHITE
+    return bool(far and noise and gain(smaller, model) > -LIKELY)
 
 
 def _without_each(train: Objective, validation: Objective, model: Model) -> list[Model]:

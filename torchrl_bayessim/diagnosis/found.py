@@ -27,7 +27,8 @@ from .validation import NEGLIGIBLE
 _WORTH = 0.01  # of the gap on test runs, to name chance beside another cause
 _CERTAIN = 100.0  # deviance on training and validation runs, to be named for less
 _REST = 0.25  # of what effects leave
-_LEFT, _MOST_OF_IT = 1.5, 0.4  # of the noise, what bridges leave; what is no stopgap takes of that
+_PLAIN, _MOST = 1.5, 0.5  # of the noise, what effects leave; what chance takes of that
+_LEFT, _MUCH = 1.5, 0.4  # of the noise, what bridges leave; what is no stopgap takes of that
 
 
 @dataclass(frozen=True)
@@ -114,13 +115,16 @@ def _with_chance(
 def _matters(scatter: Scatter, before: Shrinkage, after: Shrinkage) -> bool:
     """Return whether chance beside effects explains some of the gap, or of what they leave.
 
-    Test runs of which effects leave noise alone say nothing against what is certain of others.
+    Most of that where it is plainly more than noise; some of it, if chance is certain. Test runs of
+    which effects leave noise alone say nothing against what is certain of others.
     """
     if after.explained - before.explained > _WORTH:
         return True
     certain = max(one.gain for one in scatter.found) > _CERTAIN
-    left = before.effects - 1.0
-    return certain and (left < NEGLIGIBLE - 1.0 or before.effects - after.effects > _REST * left)
+    left, removed = before.effects - 1.0, before.effects - after.effects
+    if left > _PLAIN - 1.0 and removed > _MOST * left:
+        return True
+    return certain and (left < NEGLIGIBLE - 1.0 or removed > _REST * left)
 
 
 def _with_holds(found: Found, scatter: Scatter) -> Found:
@@ -130,8 +134,7 @@ def _with_holds(found: Found, scatter: Scatter) -> Found:
     """
     measured, before = scatter.with_holds(found.measured), found.measured
     gap = max(measured.refit - 1.0, 1e-9)
-    small = measured.refit - before.refit <= _WORTH * gap
-    if small and not _matter_beside(before, scatter.recorded[1]):
+    if measured.refit - before.refit <= _WORTH * gap and not scatter.recorded.matter:
         return found
     if _is_stopgap(before, gap):
         found = replace(found, effects=(), strengths={}, confused=())
@@ -140,17 +143,6 @@ def _with_holds(found: Found, scatter: Scatter) -> Found:
     (held,) = scatter.held_findings(measured, sum(e.share_of_gap for e in lasting))
     known = {**found.strengths, SensorDropout(): dict(held.strengths)}
     return _ranked(found, measured, [*lasting, held], known)
-
-
-def _matter_beside(bridged: Shrinkage, recorded: float) -> bool:
-    """Return whether samples that are held are most of what effects leave of a large gap.
-
-    Args:
-        bridged: How far the gap shrinks of samples with bridges in the places of those held.
-        recorded: What the effects leave of samples as they were recorded.
-    """
-    left = recorded - 1.0
-    return left > NEGLIGIBLE - 1.0 and recorded - bridged.effects > _MOST_OF_IT * left
 
 
 def _is_stopgap(bridged: Shrinkage, gap: float) -> bool:
@@ -163,7 +155,7 @@ def _is_stopgap(bridged: Shrinkage, gap: float) -> bool:
         gap: As it was recorded.
     """
     explained, left = bridged.refit - bridged.effects, bridged.refit - 1.0
-    much = bridged.refit > _LEFT and explained > _MOST_OF_IT * left
+    much = bridged.refit > _LEFT and explained > _MUCH * left
     return explained <= _WORTH * gap and not much
 
 

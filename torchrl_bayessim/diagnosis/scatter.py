@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-__all__ = ["Scatter", "Sent", "gap_with_holds"]
+__all__ = ["Recorded", "Scatter", "Sent", "gap_with_holds"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,31 +25,46 @@ from .segments import Segments
 from .selection import Selection
 from .shrinkage import Shrinkage
 from .splits import split
+from .validation import NEGLIGIBLE
 
 _DRAWS = 1000
-_NOTHING = 1.0, 1.0  # noise alone
+_MOST = 0.5  # of what effects leave
 
 
-def gap_with_holds(
-    prepared: Prepared, logs: Sequence[Log], selection: Selection
-) -> tuple[float, float]:
-    """Return mean squared innovations of test segments cut from the logs as recorded.
+class Recorded(NamedTuple):
+    """Mean squared innovations of test segments, samples that were held among them.
 
-    Without effects, and with those that were found.
+    Attributes:
+        refit: As they were recorded, without effects.
+        effects: With those that last.
+        bridged: The same with other samples in the place of those that were held.
     """
+
+    refit: float = 1.0
+    effects: float = 1.0
+    bridged: float = 1.0
+
+    @property
+    def matter(self) -> bool:
+        """Whether held samples are most of what effects leave, and that is more than noise."""
+        left = self.effects - 1.0
+        return left > NEGLIGIBLE - 1.0 and self.effects - self.bridged > _MOST * left
+
+
+def gap_with_holds(prepared: Prepared, logs: Sequence[Log], selection: Selection) -> Recorded:
+    """Return what is left of test segments cut from the logs as recorded, and as bridged."""
     test = prepared.sets["test"]
     if test.segments.uncertainty is not None:  # the held samples entered the estimates too
-        return _NOTHING
+        return Recorded()
     whole, size = split(logs)["test"], len(test.segments)
     if test.segments.touching is not None:
         theta = test.theta(selection.nominal.fit.point.z)
         whole = settled(prepared.predictor, whole, theta=theta, noise=prepared.noise)
     pieces = prepared.mode.cut(whole, prepared.horizon, history=test.segments.history, most=size)
     if len(pieces) != size:
-        return _NOTHING
-    models = selection.nominal, selection.best
-    without, beside = _along(test, pieces, [model.fit.point for model in models]).tolist()
-    return without, beside
+        return Recorded()
+    points = [selection.nominal.fit.point, selection.best.fit.point]
+    return Recorded(*_along(test, pieces, points), *_along(test, test.segments, points[1:]))
 
 
 def _along(test: Objective, pieces: Segments, points: Sequence[Point]) -> NDArray[np.float64]:
@@ -152,8 +167,7 @@ class Scatter:
         found: Those that explain the scatter, the likeliest first.
         least: Of each that was looked for, the least strength that would have been seen.
         holds: Channels whose samples were not always renewed.
-        recorded: Mean squared innovations of test segments with samples as they were recorded,
-            without effects and with those that last; 1 where what was compared is that.
+        recorded: What is left of test segments with samples as they were recorded.
         hidden: Names of those that what was found to be late may be in truth.
         sent: Of the commands that were sent, where others are taken to have arrived.
     """
@@ -161,7 +175,7 @@ class Scatter:
     found: Sequence[Chance]
     least: Mapping[Unit, float]
     holds: Sequence[Hold]
-    recorded: tuple[float, float]
+    recorded: Recorded
     hidden: Sequence[str] = ()
     sent: Sent | None = None
 
@@ -215,7 +229,7 @@ class Scatter:
 
     def with_holds(self, before: Shrinkage) -> Shrinkage:
         """Return how far the gap of the samples as they were recorded shrinks."""
-        refit = max(self.recorded[0], before.refit)
+        refit = max(self.recorded.refit, before.refit)
         return self._from(before, max(before.raw, refit), refit)
 
     def with_arrivals(self, before: Shrinkage, sent: Sent) -> Shrinkage:

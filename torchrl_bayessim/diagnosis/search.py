@@ -2,7 +2,8 @@
 
 A round screens all units beside the model that there is, fits what may be added, and keeps what is
 worth it; in the end every unit has to show that the model needs it, and what is found beside less
-than a round had counts too.
+than a round had counts too. Where that leaves more than noise, two effects are looked for of which
+neither explains most alone.
 """
 
 from __future__ import annotations
@@ -24,7 +25,16 @@ from .form_fit import softened, with_fitted_forms, with_forms_anew
 from .free_numbers import priced
 from .further_effects import identified, no_rival, nothing_left, stands_apart
 from .little_left import all_of_little, little_left, one_alone
-from .model import WHITE, Model, best_by_effect, criterion, judged, judged_fits, shown
+from .model import (
+    WHITE,
+    Model,
+    as_good,
+    best_by_effect,
+    criterion,
+    judged,
+    judged_fits,
+    shown,
+)
 from .objective import Objective, Point, Unit
 from .refit import Fit, refit
 from .rounded_commands import rounded
@@ -38,6 +48,7 @@ _HALF = 0.5  # of what is left
 _LESS, _FORMS = 0.05, 3  # of what is explained; models that explain all but that
 _MUCH = 5.0  # mean squared innovation: a law that is stuck where it began may leave as much
 _ROUGH, _BEGINNINGS = 2.0, 5  # mean squared innovation of what two may explain; others tried
+_MANY = 150  # effects at their places, of which another round takes too long
 _UNSEEN = 1.0  # a deviance, in units of the dispersion, that no test can detect
 
 
@@ -85,14 +96,14 @@ class Search:
         self.units: Sequence[Unit] = offered
         self.tried, self.screens, self.p_values = [start], list[Screen](), list[float]()
 
-    def best(self, found: Model | None = None) -> Model:
+    def best(self, base: Model | None = None) -> Model:
         """Return what the data need: what is found beside less than a round had counts too.
 
         Args:
-            found: To go on from; default the parameters alone.
+            base: To go on from; default the parameters alone.
         """
-        best = found or self.start
-        for rounds in range(1, _MOST + 1):
+        best = base or self.start
+        for rounds in range(1 + len(best.names), _MOST + 1):
             further = self._further(best)
             found = further or best
             if further is not None and rounds < _MOST:
@@ -105,25 +116,33 @@ class Search:
         return best
 
     def or_two_others(self, best: Model) -> Model:
-        """Return the model, or one of two effects that leave noise alone where its own does not.
+        """Return the model, or one of two effects that leave noise alone where its own do not.
 
         The effect that explains most alone may be neither of them: a spring beside a heavier rotor
-        is nearly a payload. So what explains less alone is gone on from, too.
+        is nearly a payload. So a search that began anew goes on from what explains less alone, too.
         """
         rough = _ROUGH if len(best.names) == 1 else WHITE  # a law may have another form
-        if self.varied or not best.units or best.mean_square < rough:
+        many = len(self.offered) > _MANY
+        if self.again is not None or many or not best.units or best.mean_square < rough:
             return best
-        first = set(list(best.names)[:1])
-        others = [m for m in self.tried if len(m.names) == 1 and m.names != first]
+        others = [m for m in self.tried if len(m.names) == 1 and not m.names & best.names]
         begun = list(best_by_effect(others, self.start).values())[:_BEGINNINGS]
-        found = [two for two in map(self._two, begun) if two is not None and shown(best, two)]
-        return min(found, key=lambda two: criterion(two, 1.0), default=best)
+        tried = list(self.tried)
+        found = [two for two in map(self._two, begun) if two is not None and _far(best, two)]
+        two = min(found, key=lambda two: criterion(two, 1.0), default=best)
+        if two is best or any(as_good(two, other) for other in found if other is not two):
+            self.tried[:] = tried
+            return best
+        self.units = self.offered
+        return two
 
     def _two(self, one: Model) -> Model | None:
         """Return a model of an effect and a second one, if they leave noise alone."""
         self.progress(f"searching on from {next(iter(one.names))}")
-        left = [unit for unit in with_forms_of(self.units, one) if unit not in one.units]
-        now = compare(self.sets[0], one.fit, left)
+        base = refit(self.sets[0], [one.fit.point], iterations=0)[0]
+        left = [unit for unit in with_forms_of(self.offered, one) if unit not in one.units]
+        left = with_shapes(left, _beside(one, self.shapes(base.point)))
+        now = compare(self.sets[0], base, left)
         better = lambda models: self._better(one, models, seen=now.seen)
         two = self._explained(now, lambda models: better([m for m in models if len(m.names) == 2]))
         two = None if two is None else self._needs(two)
@@ -231,6 +250,12 @@ class Search:
         needs = without_stopgaps(*self.sets, needs, self.offered)
         self.tried += [*dropped, needs]
         return needs
+
+
+def _far(best: Model, two: Model) -> bool:
+    """Return whether two effects take most of what a model leaves, on runs that judge, too."""
+    taken = best.mean_square - two.mean_square
+    return taken > _HALF * (best.mean_square - 1.0) and shown(best, two)
 
 
 def _nearly(base: Fit, better: Model, other: Model) -> bool:

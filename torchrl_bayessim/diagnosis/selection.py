@@ -4,7 +4,8 @@ Screening ranks units by linear algebra; what survives is fitted jointly with th
 judged on validation segments. Effects interact: on robot logs one effect explained 13 % alone and
 58 % beside another. So the search starts from the best units, the best *pairs* (all of them, from
 the screen's correlations, at no cost), and each effect at all of its targets, and goes on from the
-best few; afterwards every unit has to show that the model needs it.
+best few; afterwards every unit has to show that the model needs it. Where more than noise is left,
+it goes on from effects that explain less alone, too.
 """
 
 from __future__ import annotations

@@ -10,19 +10,20 @@ from dataclasses import replace
 import numpy as np
 
 from ..effects.action import PacketDrop
+from ..effects.sensors import SensorDropout
 from ..logs.log import Log
 from .beside_jitter import beside_jitter, outdone
 from .beside_losses import Sought
 from .chance import Chance, chances, detectable, of_chance, unseen
 from .holds import Hold
 from .loss_suspects import Suspects
-from .losses import losses
+from .losses import losses, may_be_beside
 from .lost_commands import beside_lost_commands
 from .lost_samples import beside_lost_samples
 from .model import WHITE, Model, judged_fits
 from .objective import Unit
 from .preparation import Prepared
-from .scatter import Scatter, gap_with_holds
+from .scatter import Recorded, Scatter, gap_with_holds
 from .selection import Selection
 from .varying import varying, with_variation
 
@@ -58,7 +59,7 @@ def with_chance(
     """
     random, suspects = of_chance(units), Suspects.of(prepared, selection, units)
     found = losses(prepared, selection, suspects) if suspects else []
-    sent, shaken, recorded = None, None, (1.0, 1.0)
+    sent, shaken, recorded = None, None, Recorded()
     seen = replace(prepared, alarms=alarms)
     if holds:
         recorded = gap_with_holds(prepared, logs, selection)
@@ -74,6 +75,9 @@ def with_chance(
             prepared, selection = shaken.prepared, shaken.selection
     found = found or chances(prepared.sets, selection, random)
     elsewhere = sent is None and shaken is None and not holds
+    if elsewhere and not found:
+        lost = [unit for unit in random if _may_be_lost_beside(unit, selection.best)]
+        found = chances(prepared.sets, selection, lost, beside=True)
     if elsewhere and not any(chance.beside for chance in found):
         prepared, more = _beside_variation(search, prepared, selection, random)
         if more is not selection:
@@ -89,6 +93,12 @@ def _may_be_jitter(
     """Return whether nothing was lost, or jitter is likelier than losses of commands."""
     commands = all(isinstance(one.unit.effect, PacketDrop) for one in found)
     return commands and (suspects is None or not found or outdone(suspects, found, units))
+
+
+def _may_be_lost_beside(unit: Unit, best: Model) -> bool:
+    """Return whether values may be lost beside effects that are there, and are not those."""
+    losses = isinstance(unit.effect, PacketDrop | SensorDropout)
+    return losses and may_be_beside(unit, best.units)
 
 
 def _beside_variation(

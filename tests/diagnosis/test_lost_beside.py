@@ -1,0 +1,37 @@
+"""Commands that are lost beside a law that lasts, where single losses are too small to be seen."""
+
+import numpy as np
+import pytest
+from test_chance import lost
+from test_diagnose import logs, system
+
+from torchrl_bayessim.diagnosis.diagnose import diagnose
+
+SOME = (
+    "parallel_spring", "packet_drop", "sensor_dropout", "action_delay", "coulomb_friction",
+    "battery_sag",
+)  # fmt: skip
+
+
+def spring(q, v):
+    return -0.4 * q
+
+
+def test_lost_commands_are_named_beside_a_spring():
+    """They change little from one to the next, so that each that is lost is as much as noise."""
+    act = lost(0.15, np.random.default_rng(1))
+    report = diagnose(system(), None, logs(8, act=act, push=spring), effects=SOME)
+    found = {effect.name: effect for effect in report.effects}
+    assert set(found) == {"parallel_spring", "packet_drop"}
+    assert found["parallel_spring"].strength == pytest.approx(0.4, rel=0.05)
+    low, high = found["packet_drop"].ci95
+    assert low < 0.15 < high
+    assert report.gap.with_effects == pytest.approx(1.0, abs=0.3)
+
+
+def test_nothing_is_lost_beside_a_law_that_is_not_quite_the_true_one():
+    def stiffer(q, v):
+        return -0.4 * q - 0.2 * np.tanh(v / 2.0) * q**2
+
+    report = diagnose(system(), None, logs(8, push=stiffer), effects=SOME)
+    assert not {effect.name for effect in report.effects} & {"packet_drop", "sensor_dropout"}
