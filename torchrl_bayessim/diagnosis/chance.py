@@ -50,6 +50,7 @@ _WHITE = 1.15  # mean squared innovation of a model that leaves nothing to chanc
 CALM = 1.3  # φ beyond which an effect of chance has not explained the scatter
 _SEGMENTS = 8  # of each split
 _APART = 4  # targets of one effect that are looked at singly
+_ELSEWHERE = 0.5  # of what a loss at one place explains, by that at another
 _LEAST = 0.3  # relative error of a strength: so few draws do not span what chance may do
 _NEEDED, _NEEDED_BESIDE = 20.0, 40.0  # deviance, to be found
 
@@ -138,7 +139,9 @@ def chances(
     judged = [Judged.of(sets[name], point, _SEGMENTS) for name in ("train", "validation")]
     base = deviances_without(judged, selection.best.fit.point)
     best = _likeliest(judged, point, [(u, level * u.high) for u in units for level in _LEVELS])
-    least = min(cost for cost, _ in best.values())
+    if beside:
+        best = _of_one_place(best, float(base.sum()))
+    least = min((cost for cost, _ in best.values()), default=np.inf)
     if base.sum() - least < needed:
         return []
     found = [
@@ -251,6 +254,22 @@ def _refined(
         before=float((unseen.left**2).mean()) if point.strengths else None,
         beside=bool(point.strengths),
     )
+
+
+def _of_one_place(
+    best: Mapping[Unit, tuple[float, float]], base: float
+) -> dict[Unit, tuple[float, float]]:
+    """Return deviances of units without effects that several places explain, each alone.
+
+    What is a little wrong everywhere looks as if commands of any drive were lost now and then.
+    """
+    kept = dict(best)
+    for name in {unit.name for unit in best}:
+        single = [u for u in best if u.name == name and len(u.targets) == 1]
+        gains = sorted(base - best[unit][0] for unit in single)
+        if len(gains) > 1 and gains[-2] > _ELSEWHERE * gains[-1]:
+            kept = {unit: told for unit, told in kept.items() if unit.name != name}
+    return kept
 
 
 def _with(point: Point, unit: Unit, strength: float) -> Point:
