@@ -1,16 +1,28 @@
 """Commands that are lost beside a law that lasts, where single losses are too small to be seen."""
 
+from dataclasses import dataclass, field
+
 import numpy as np
 import pytest
 from test_chance import lost
 from test_diagnose import logs, system
 
+from torchrl_bayessim.diagnosis.chance import _of_one_place
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 
 SOME = (
     "parallel_spring", "packet_drop", "sensor_dropout", "action_delay", "coulomb_friction",
     "battery_sag",
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PlainUnit:
+    """An effect at some targets."""
+
+    name: str
+    where: str
+    targets: list[int] = field(hash=False)
 
 
 def spring(q, v):
@@ -35,3 +47,19 @@ def test_nothing_is_lost_beside_a_law_that_is_not_quite_the_true_one():
 
     report = diagnose(system(), None, logs(8, push=stiffer), effects=SOME)
     assert not {effect.name for effect in report.effects} & {"packet_drop", "sensor_dropout"}
+
+
+@pytest.mark.parametrize(
+    ("gains", "kept"),
+    [
+        ({"one": 202.0, "two": 184.0, "both": 175.0}, {"sample"}),  # either, as it seems
+        ({"one": 202.0, "two": 90.0, "both": 175.0}, {"one", "two", "both", "sample"}),
+        ({"one": 202.0}, {"one", "sample"}),
+    ],
+)
+def test_losses_that_several_drives_explain_alone_are_those_of_none(gains, kept):
+    targets = {"one": [0], "two": [1], "both": [0, 1]}
+    units = [PlainUnit("packet_drop", where, targets[where]) for where in gains]
+    best = {unit: (300.0 - gains[unit.where], 0.1) for unit in units}
+    best[PlainUnit("sensor_dropout", "sample", [0])] = (310.0, 0.1)
+    assert {unit.where for unit in _of_one_place(best, 300.0)} == kept
