@@ -116,26 +116,28 @@ def twice_and_at_rest(log, rows, rng):
     )
 
 
-def test_a_few_are_named_beside_an_effect_that_does_a_hundred_times_as_much():
-    rng = np.random.default_rng(6)
-    data = logs(8, push=lambda q, v: 0.3)
-    data = [shown_again(log, 0.04, rng) for log in data]
-    some = ("constant_force", "viscous_friction", "sensor_dropout", "sensor_delay", "action_lag")
+def named_beside_held(cause, push, *, share, seed):
+    """Return what is named, where angles are held, too, and that it is the cause and those."""
+    rng = np.random.default_rng(seed)
+    data = [shown_again(log, share, rng) for log in logs(8, push=push)]
+    some = (cause, "viscous_friction", "sensor_dropout", "sensor_delay", "action_lag")
     report = diagnose(system(), None, data, effects=some)
     found = {effect.name: effect for effect in report.effects}
-    assert set(found) == {"constant_force", "sensor_dropout"}
-    assert found["constant_force"].strength == pytest.approx(0.3, rel=0.05)
-    assert found["sensor_dropout"].strength == pytest.approx(0.04, rel=0.5)
-    assert found["sensor_dropout"].share_of_gap < 0.01
+    assert set(found) == {cause, "sensor_dropout"}
+    return found[cause], found["sensor_dropout"]
+
+
+def test_a_few_are_named_beside_an_effect_that_does_a_hundred_times_as_much():
+    force, held = named_beside_held("constant_force", lambda q, v: 0.3, share=0.04, seed=6)
+    assert force.strength == pytest.approx(0.3, rel=0.05)
+    assert held.strength == pytest.approx(0.04, rel=0.5)
+    assert held.share_of_gap < 0.01
 
 
 def test_friction_is_found_beside_them():
-    rng = np.random.default_rng(3)
-    data = logs(8, push=lambda q, v: -0.1 * np.tanh(v / 0.01))
-    data = [shown_again(log, 0.2, rng) for log in data]
-    some = ("coulomb_friction", "viscous_friction", "sensor_dropout", "sensor_delay", "action_lag")
-    report = diagnose(system(), None, data, effects=some)
-    found = {effect.name: effect for effect in report.effects}
-    assert set(found) == {"coulomb_friction", "sensor_dropout"}
-    assert found["coulomb_friction"].strength == pytest.approx(0.1, rel=0.1)
-    assert found["sensor_dropout"].strength == pytest.approx(0.2, rel=0.2)
+    def friction(q, v):
+        return -0.1 * np.tanh(v / 0.01)
+
+    dry, held = named_beside_held("coulomb_friction", friction, share=0.2, seed=3)
+    assert dry.strength == pytest.approx(0.1, rel=0.1)
+    assert held.strength == pytest.approx(0.2, rel=0.2)

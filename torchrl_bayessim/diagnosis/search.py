@@ -8,7 +8,7 @@ neither explains most alone.
 
 from __future__ import annotations
 
-__all__ = ["Search", "exactly", "with_forms_of"]
+__all__ = ["MANY", "Search", "exactly", "with_forms_of"]
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -48,7 +48,7 @@ _HALF = 0.5  # of what is left
 _LESS, _FORMS = 0.05, 3  # of what is explained; models that explain all but that
 _MUCH = 5.0  # mean squared innovation: a law that is stuck where it began may leave as much
 _ROUGH, _BEGINNINGS = 2.0, 5  # mean squared innovation of what two may explain; others tried
-_MANY = 150  # effects at their places, of which another round takes too long
+MANY = 150  # effects at their places, of which another round takes too long
 _UNSEEN = 1.0  # a deviance, in units of the dispersion, that no test can detect
 
 
@@ -122,7 +122,7 @@ class Search:
         is nearly a payload. So a search that began anew goes on from what explains less alone, too.
         """
         rough = _ROUGH if len(best.names) == 1 else WHITE  # a law may have another form
-        many = len(self.offered) > _MANY
+        many = len(self.offered) > MANY
         if self.again is not None or many or not best.units or best.mean_square < rough:
             return best
         others = [m for m in self.tried if len(m.names) == 1 and not m.names & best.names]

@@ -113,21 +113,10 @@ def select(
         again=again, varied=varied,
         shapes=shapes, alpha=alpha, generator=generator, progress=progress,
     )  # fmt: skip
-
-    def settled(needs: Model) -> tuple[Model, dict[str, tuple[Model, ...]]]:
-        instead = partial(
-            alternatives, train, validation,
-            units=with_forms_of(search.units, needs), first=search.screens[0], offered=units,
-        )  # fmt: skip
-        return _settled(
-            train, validation, needs, instead,
-            tried=search.tried, offered=units, progress=progress,
-        )  # fmt: skip
-
-    best, others = settled(search.best())
+    best, others = _settled(search, search.best())
     two = search.or_two_others(best)
     if two is not best:
-        best, others = settled(search.best(two))
+        best, others = _settled(search, search.best(two))
     found = tuple(search.screens), tuple(search.p_values), tuple(search.tried), others
     return Selection(start, best, *found, offered=tuple(units))
 
@@ -142,26 +131,21 @@ def _anew(train: Objective, validation: Objective, known: Selection) -> list[Mod
     return judged_fits(train, validation, points, iterations=_AGAIN)
 
 
-def _settled(
-    train: Objective,
-    validation: Objective,
-    best: Model,
-    instead: Callable[..., dict[str, tuple[Model, ...]]],
-    *,
-    tried: list[Model],
-    offered: Sequence[Unit],
-    progress: Callable[[str], None],
-) -> tuple[Model, dict[str, tuple[Model, ...]]]:
+def _settled(search: Search, best: Model) -> tuple[Model, dict[str, tuple[Model, ...]]]:
     """Return the best model, after exchanges, and the models with others instead."""
+    instead = partial(
+        alternatives, *search.sets,
+        units=with_forms_of(search.units, best), first=search.screens[0], offered=search.offered,
+    )  # fmt: skip
     for exchanges in range(_EXCHANGES + 1):
         if not best.units:
             break
-        progress("trying others in its place")
-        others = instead(best, tried=tried)
-        tried += [model for models in others.values() for model in models]
-        better = exchanged(best, others, offered)
+        search.progress("trying others in its place")
+        others = instead(best, tried=search.tried)
+        search.tried += [model for models in others.values() for model in models]
+        better = exchanged(best, others, search.offered)
         if better is best or exchanges == _EXCHANGES:
             return best, others
-        best, dropped = eliminated(train, validation, exactly(train, validation, better))
-        tried += dropped
+        best, dropped = eliminated(*search.sets, exactly(*search.sets, better))
+        search.tried += dropped
     return best, {}

@@ -24,13 +24,13 @@ from .model import WHITE, Model, judged_fits
 from .objective import Unit
 from .preparation import Prepared
 from .scatter import Recorded, Scatter, gap_with_holds
+from .search import MANY
 from .selection import Selection
 from .varying import varying, with_variation
 
 Search = Callable[..., tuple[Prepared, Selection]]
 _AGAIN = 4  # steps of fits whose noise was another
 _INSTEAD = 0.5  # share of what is left beyond noise
-_MOST = 150  # effects at their places that are searched through again
 _REST = "{}, as it seems: that explains what remains"
 
 
@@ -106,7 +106,7 @@ def _beside_variation(
 ) -> tuple[Prepared, Selection]:
     """Return what is found beside effects that vary by chance; the same if it is no more."""
     # of legs with twelve joints, once more through all of it takes too long
-    few = len(selection.offered) <= _MOST
+    few = len(selection.offered) <= MANY
     found = varying(prepared, selection.best, selection.offered, random) if few else None
     if found is None:
         return prepared, selection
