@@ -10,12 +10,11 @@ from scipy.stats import multivariate_normal
 from test_diagnose import ARM, FINER, as_log, commands, system
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
-from torchrl_bayessim.diagnosis.model import Model, shown
+from torchrl_bayessim.diagnosis.model import Model, shown, takes_most
 from torchrl_bayessim.diagnosis.objective import Objective, Point
 from torchrl_bayessim.diagnosis.refit import Fit
 from torchrl_bayessim.diagnosis.varying import _cost, _widened, varying
 from torchrl_bayessim.diagnosis.whitening import Whitening
-from torchrl_bayessim.diagnosis.with_chance import explains
 
 SEGMENTS, NUMBERS, DRAWS = 5, 6, 3
 
@@ -96,7 +95,7 @@ def test_a_run_may_be_next_to_nothing_worse_for_what_others_show_plainly(train, 
 )
 def test_what_explains_a_variation_is_not_found_beside_it(left, after, instead):
     before = of_runs([left] * 3, left, (A,))
-    assert explains(before, of_runs([after] * 3, after, (A, C))) is instead
+    assert takes_most(before, of_runs([after] * 3, after, (A, C))) is instead
 
 
 def test_a_model_without_effects_varies_in_nothing():

@@ -22,13 +22,12 @@ from .beside_losses import CERTAIN, Beside, Sought
 from .chance import Chance
 from .elimination import parts
 from .evident_losses import Evident, evident, lost_beside
-from .model import WHITE
+from .model import WHITE, takes_most
 from .preparation import Prepared
 from .prepared_anew import with_other_logs
 from .selection import Selection
 
 _ROUNDS = 3  # of deciding which commands arrived and searching on
-_HALF = 0.5  # of what parameters leave of the commands that arrived
 
 
 def beside_lost_commands(sought: Sought) -> Beside | None:
@@ -76,8 +75,8 @@ def _needed(
 
 def _matters(selection: Selection) -> bool:
     """Return whether effects take half of what parameters leave, or wrong decisions may be all."""
-    before, after = (m.mean_square for m in (selection.nominal, selection.best))
-    return before > WHITE and before - after > _HALF * (before - 1.0)
+    before, after = selection.nominal, selection.best
+    return before.mean_square > WHITE and takes_most(before, after)
 
 
 def _searched(

@@ -18,6 +18,7 @@ __all__ = [
     "shown",
     "shown_by_the_fit",
     "shown_together",
+    "takes_most",
     "total_gain",
 ]
 
@@ -40,6 +41,7 @@ _WORSE = 1.5  # times the misfit of the best model: too much for an equal, howev
 _CERTAIN, _SEVERAL = 5.0, 2  # times what judging runs must gain; runs of the fit that gain it
 _BESIDE = 100.0  # deviance that segments gain beside the one that gains most, which may be odd
 _TOGETHER = 6.0  # the same of all runs together, where noise alone seems left
+_MOST = 0.5  # of what a model leaves beyond noise
 WHITE = 1.2  # mean squared innovation of a model that leaves noise alone
 
 
@@ -141,6 +143,11 @@ def total_gain(base: Model, model: Model) -> float:
 def needed(base: Model, model: Model) -> float:
     """Return the gain on validation that more strengths need: the chance level per strength."""
     return 4.0 * max(1, len(model.units) - len(base.units))
+
+
+def takes_most(before: Model, after: Model) -> bool:
+    """Return whether most of what a model leaves beyond noise is gone with another."""
+    return before.mean_square - after.mean_square > _MOST * (before.mean_square - 1.0)
 
 
 def shown(base: Model, model: Model) -> bool:

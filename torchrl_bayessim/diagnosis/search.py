@@ -34,6 +34,7 @@ from .model import (
     judged,
     judged_fits,
     shown,
+    takes_most,
 )
 from .objective import Objective, Point, Unit
 from .refit import Fit, refit
@@ -44,7 +45,6 @@ from .wavering import waver
 
 Array = NDArray[np.float64]
 _MOST = 4  # effects in one explanation
-_HALF = 0.5  # of what is left
 _LESS, _FORMS = 0.05, 3  # of what is explained; models that explain all but that
 _MUCH = 5.0  # mean squared innovation: a law that is stuck where it began may leave as much
 _ROUGH, _BEGINNINGS = 2.0, 5  # mean squared innovation of what two may explain; others tried
@@ -128,7 +128,8 @@ class Search:
         others = [m for m in self.tried if len(m.names) == 1 and not m.names & best.names]
         begun = list(best_by_effect(others, self.start).values())[:_BEGINNINGS]
         tried = list(self.tried)
-        found = [two for two in map(self._two, begun) if two is not None and _far(best, two)]
+        found = [two for two in map(self._two, begun) if two is not None and takes_most(best, two)]
+        found = [two for two in found if shown(best, two)]
         two = min(found, key=lambda two: criterion(two, 1.0), default=best)
         if two is best or any(as_good(two, other) for other in found if other is not two):
             self.tried[:] = tried
@@ -252,12 +253,6 @@ class Search:
         return needs
 
 
-def _far(best: Model, two: Model) -> bool:
-    """Return whether two effects take most of what a model leaves, on runs that judge, too."""
-    taken = best.mean_square - two.mean_square
-    return taken > _HALF * (best.mean_square - 1.0) and shown(best, two)
-
-
 def _nearly(base: Fit, better: Model, other: Model) -> bool:
     """Return whether as few effects explain nearly as much on the runs of the fit."""
     explained = base.cost - better.fit.cost
@@ -286,7 +281,7 @@ def _may_be_rounded(base: Model, better: Model | None) -> bool:
     """Return whether commands may be rounded: they are, or half of what a base leaves is left."""
     if better is None or ActionQuantization.name in better.names:
         return True
-    return base.mean_square - better.mean_square < _HALF * (base.mean_square - 1.0)
+    return not takes_most(base, better)
 
 
 def _beside(model: Model, found: Sequence[Unit]) -> list[Unit]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["explains", "with_chance"]
+__all__ = ["with_chance"]
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -20,7 +20,7 @@ from .loss_suspects import Suspects
 from .losses import losses, may_be_beside
 from .lost_commands import beside_lost_commands
 from .lost_samples import beside_lost_samples
-from .model import WHITE, Model, judged_fits
+from .model import WHITE, Model, judged_fits, takes_most
 from .objective import Unit
 from .preparation import Prepared
 from .scatter import Recorded, Scatter, gap_with_holds
@@ -30,7 +30,6 @@ from .varying import varying, with_variation
 
 Search = Callable[..., tuple[Prepared, Selection]]
 _AGAIN = 4  # steps of fits whose noise was another
-_INSTEAD = 0.5  # share of what is left beyond noise
 _REST = "{}, as it seems: that explains what remains"
 
 
@@ -118,7 +117,9 @@ def _beside_variation(
         rest = more.best.mean_square < WHITE
         return prepared.alarmed(_REST.format(found.what)) if rest else prepared, selection
     refused = any(more.best.names <= model.names for model in selection.tried)
-    if refused and explains(selection.best, _under_noise_alone(prepared, more.best)):
+    # what explains that without a variation and was refused stands in its place, not beside it:
+    # where something varies a little of everything helps
+    if refused and takes_most(selection.best, _under_noise_alone(prepared, more.best)):
         return prepared, selection
     return wider, more.seen_as(selection)
 
@@ -127,17 +128,3 @@ def _under_noise_alone(prepared: Prepared, model: Model) -> Model:
     """Return a model that was found beside a variation, fitted without it."""
     train, validation = prepared.sets["train"], prepared.sets["validation"]
     return judged_fits(train, validation, [model.fit.point], iterations=_AGAIN)[0]
-
-
-def explains(before: Model, after: Model) -> bool:
-    """Return whether most of what is left beyond noise is gone: what varied is explained then.
-
-    What is found in the place of a variation, and not beside it, and was refused without it, is not
-    to be had by it: where something varies a little of everything helps.
-
-    Args:
-        before: The model beside which something varies.
-        after: With what was found, under noise alone.
-    """
-    left = before.mean_square - 1
-    return before.mean_square - after.mean_square > _INSTEAD * left
