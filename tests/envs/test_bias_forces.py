@@ -121,3 +121,24 @@ def test_it_is_computed_once_and_only_if_something_looks():
     assert len(asked) == 1
     with pytest.raises(AttributeError, match="something that the task reads, got 'xpos'"):
         _ = now.xpos
+
+
+def test_only_those_that_are_asked_for_are_computed():
+    stepper = moving()
+    bias = BiasForces(stepper)
+    asked = []
+
+    def of(rows=None):
+        asked.append(rows)
+        return bias(rows)
+
+    now = BeforeStep(of, qpos=torch.zeros(3, 2))
+    some = torch.tensor([True, False, True])
+    found = now.bias_of(some)
+    assert asked[0].tolist() == [0, 2]
+    np.testing.assert_array_equal(found[some], bias()[some])
+    assert found[1].tolist() == [0.0, 0.0]
+    # all of them are those that others have asked for, too
+    np.testing.assert_array_equal(now.bias_of(torch.ones(3, dtype=torch.bool)), bias())
+    np.testing.assert_array_equal(now.bias_of(some), now.qfrc_bias)
+    assert len(asked) == 2

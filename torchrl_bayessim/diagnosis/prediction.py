@@ -300,7 +300,7 @@ class Predictor:
             ctrl = torch.from_numpy(kept.controls(commands[:, t]))
             for left in reversed(range(parts)):
                 state = {n: torch.from_numpy(stepper[n][rows]) for n in ("qpos", "qvel", "time")}
-                now = BeforeStep(partial(self._bias, rows), **state, ctrl=ctrl)
+                now = BeforeStep(partial(self._bias_of, rows), **state, ctrl=ctrl)
                 added, memories = self._forcing(active, memories, now, timestep=held)
                 for name, at in self._entries.items():
                     if name in added:
@@ -320,6 +320,10 @@ class Predictor:
                 )
                 alive[alive] = stepper.status[going] == 0
             simulated[rows[alive], t] = stepper.outputs[rows[alive], 0]
+
+    def _bias_of(self, rows: NDArray[np.int64], some: NDArray[np.int64] | None = None) -> Tensor:
+        """Return ``qfrc_bias`` of rows, or of some among them."""
+        return self._bias(rows if some is None else rows[some])
 
     def _place_welds(self) -> None:
         """Let the first command step from where the welded body is in each start state.

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..envs.bias_forces import BeforeStep
 from ..envs.task import Readings
 from .effect import ForceEffect, Memory
 from .robot import Robot
@@ -147,6 +148,11 @@ class _TimeStep(SimpleNamespace):
     @cached_property
     def bias(self) -> Tensor:
         return self.state.qfrc_bias[..., self.dofs]
+
+    def bias_of(self, some: Tensor) -> Tensor:
+        if isinstance(self.state, BeforeStep):
+            return self.state.bias_of(some)[..., self.dofs]
+        return self.bias
 
     @cached_property
     def load(self) -> Tensor:

@@ -182,9 +182,9 @@ class LoadDependentFriction(ForceEffect):
     ) -> tuple[Mapping[str, Tensor], Memory]:
         """Return the dry friction under this load."""
         outside = now.robot.passive | self.external
-        load = now.load
-        if strength[..., outside].any():  # what is outside takes as long as a time step
-            load = load + torch.where(outside, now.bias, 0.0)
+        load, weighed = now.load, strength[..., outside].any(-1)
+        if weighed.any():  # what is outside takes as long as a time step
+            load = load + torch.where(outside, now.bias_of(weighed), 0.0)
         return {"frictionloss": strength * load.abs()}, memory
 
 

@@ -27,11 +27,12 @@ class BeforeStep(Readings):
     """What may be looked at before a time step: arrays by name, and ``qfrc_bias``.
 
     Args:
-        bias: Returns ``qfrc_bias``, shape ``(*batch, nv)``; asked where something looks at it.
+        bias: Returns ``qfrc_bias``, shape ``(*batch, nv)``, or that of some of a batch ``(N,)`` by
+            their numbers, ``(R, nv)``; asked where something looks at it.
         arrays: ``qpos``, ``qvel``, ``time`` and ``ctrl``, shape ``(*batch, size)``.
     """
 
-    def __init__(self, bias: Callable[[], Tensor], **arrays: Tensor) -> None:
+    def __init__(self, bias: Callable[..., Tensor], **arrays: Tensor) -> None:
         super().__init__(**arrays)
         self._bias = bias
 
@@ -39,6 +40,18 @@ class BeforeStep(Readings):
     def qfrc_bias(self) -> Tensor:
         """Gravity, Coriolis and centrifugal forces, N m or N."""
         return self._bias()
+
+    def bias_of(self, some: Tensor) -> Tensor:
+        """Return ``qfrc_bias`` of some simulations, shape ``(*batch,)``, and 0 of all others.
+
+        It takes nearly as long as a time step where all are asked for.
+        """
+        if "qfrc_bias" in vars(self) or some.ndim != 1 or bool(some.all()):
+            return self.qfrc_bias
+        found = self._bias(some.nonzero()[:, 0].numpy())
+        forces = found.new_zeros(len(some), found.shape[1])
+        forces[some] = found
+        return forces
 
 
 class BiasForces:
@@ -65,7 +78,8 @@ class BiasForces:
             )
         if other.models is not stepper.models:
             other.use(stepper.models)
-        other.state[:] = stepper.state[:, : other.state.shape[1]]
+        asked = slice(None) if rows is None else rows
+        other.state[asked] = stepper.state[asked, : other.state.shape[1]]
         other.begin(rows)
         bias = other.outputs[:, 0]
         return torch.from_numpy(bias.copy() if rows is None else bias[rows])
