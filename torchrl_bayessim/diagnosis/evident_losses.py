@@ -25,7 +25,7 @@ from .loss_law import LossLaw, Told, Tried, likeliest
 from .loss_segments import LossSegments
 from .loss_suspects import FEWEST, JUDGED, LIKELIER, SCATTER, SPOILED, Alone, spoiled_share
 from .losses import EVIDENT, SHARES, WRONG, found_beside, may_be_beside
-from .model import Model
+from .model import WHITE, Model
 from .objective import Point, Unit
 from .prepared_anew import with_other_logs
 from .refit import refit
@@ -33,6 +33,7 @@ from .refit import refit
 _TIMES = 4.0  # errors without losses per those with them
 _ROUNDS = 4  # of fitting again
 _AGAIN = 6  # steps of these fits
+_MOST = 0.5  # of what effects that last explain
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +75,8 @@ def evident(sought: Sought) -> Evident | None:
     """Return the likeliest losses of commands, if segments are much likelier with any.
 
     Or those that were found in the place of effects that last. Where none are plain, those that are
-    in a simulator that is fitted again, first with parameters alone.
+    in a simulator that is fitted again, first with parameters alone; but not where effects leave
+    noise alone, and losses most of what those explain.
 
     Args:
         sought: What was found, and short segments.
@@ -86,7 +88,7 @@ def evident(sought: Sought) -> Evident | None:
     bases += [(suspects.best, suspects.rival)] if best.units else []
     every = [[_likely(data, unit, alone) for unit in units] for data, alone in bases]
     plain = [one for part in every for one in part if one.plain or one.unit in known]
-    if not plain:
+    if not plain and not _outdone(sought, every[0]):
         sets = zip(every, bases, strict=True)
         again = (_fitted_again(sought, part, alone) for part, (_, alone) in sets)
         plain = list(islice(filter(None, again), 1))
@@ -95,6 +97,22 @@ def evident(sought: Sought) -> Evident | None:
     seen = min(plain, key=lambda one: one.cost)
     least = min(sum(alone.costs) for _, alone in bases)
     return Evident(seen.unit, seen.law, seen.data[JUDGED[0]].point, least, suspects.nominal)
+
+
+def _outdone(sought: Sought, found: Sequence[_Likely]) -> bool:
+    """Return whether effects that last leave noise alone, and losses most of what those explain.
+
+    Fitting again may make losses a little likelier, but it takes as long as a search.
+
+    Args:
+        sought: What was found.
+        found: Losses of every unit with parameters alone.
+    """
+    suspects, best = sought.suspects, sought.selection.best
+    if not best.units or not suspects.rival.calm or best.mean_square >= WHITE:
+        return False
+    explained = sum(suspects.alone.costs) - sum(suspects.rival.costs)
+    return max((one.gained for one in found), default=0.0) < _MOST * explained
 
 
 def _likely(data: Mapping[str, LossSegments], unit: Unit, alone: Alone) -> _Likely:
