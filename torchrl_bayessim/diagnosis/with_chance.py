@@ -103,7 +103,11 @@ def _may_be_lost_beside(unit: Unit, best: Model) -> bool:
 def _beside_variation(
     search: Search, prepared: Prepared, selection: Selection, random: Sequence[Unit]
 ) -> tuple[Prepared, Selection]:
-    """Return what is found beside effects that vary by chance; the same if it is no more."""
+    """Return what is found beside effects that vary by chance; the same if it is no more.
+
+    Where that leaves noise alone without a variation, it is what was missing: a law in a form that
+    could not be told from what all of the gap hides is seen where less of it counts.
+    """
     # of legs with twelve joints, once more through all of it takes too long
     few = len(selection.offered) <= MANY
     found = varying(prepared, selection.best, selection.offered, random) if few else None
@@ -116,10 +120,14 @@ def _beside_variation(
     if not more.best.names > selection.best.names:
         rest = more.best.mean_square < WHITE
         return prepared.alarmed(_REST.format(found.what)) if rest else prepared, selection
+    plain = _under_noise_alone(prepared, more.best)
+    instead = takes_most(selection.best, plain)
+    if instead and plain.mean_square < WHITE <= selection.best.mean_square:
+        return search(prepared, known=replace(selection, best=plain))
     refused = any(more.best.names <= model.names for model in selection.tried)
     # what explains that without a variation and was refused stands in its place, not beside it:
     # where something varies a little of everything helps
-    if refused and takes_most(selection.best, _under_noise_alone(prepared, more.best)):
+    if refused and instead:
         return prepared, selection
     return wider, more.seen_as(selection)
 
