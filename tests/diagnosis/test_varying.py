@@ -1,11 +1,12 @@
 """What varies by chance widens the covariance, and no longer hides what else is missing."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
-from plain_models import A, C
+from plain_models import A, C, plain
 from scipy.stats import multivariate_normal
 from test_diagnose import ARM, FINER, as_log, commands, system
 
@@ -13,8 +14,10 @@ from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.model import Model, shown, takes_most
 from torchrl_bayessim.diagnosis.objective import Objective, Point
 from torchrl_bayessim.diagnosis.refit import Fit
+from torchrl_bayessim.diagnosis.selection import Selection
 from torchrl_bayessim.diagnosis.varying import _cost, _widened, varying
 from torchrl_bayessim.diagnosis.whitening import Whitening
+from torchrl_bayessim.diagnosis.with_chance import _beside_variation
 
 SEGMENTS, NUMBERS, DRAWS = 5, 6, 3
 
@@ -100,6 +103,41 @@ def test_what_explains_a_variation_is_not_found_beside_it(left, after, instead):
 
 def test_a_model_without_effects_varies_in_nothing():
     assert varying(SimpleNamespace(), SimpleNamespace(units=()), (), ()) is None
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "refused", "expected"),
+    [
+        (10.0, 1.0, False, "alone"),  # noise is left: nothing varied
+        (10.0, 1.0, True, "alone"),  # though it had been refused where it could not be told
+        (10.0, 3.0, False, "beside"),
+        (10.0, 3.0, True, "before"),  # a little of everything helps
+        (10.0, 8.0, True, "beside"),
+        (1.15, 1.0, False, "beside"),  # there was little to explain
+    ],
+)
+def test_what_leaves_noise_alone_without_a_variation_stands_in_its_place(
+    monkeypatch, *, before, after, refused, expected
+):
+    """Of 400 numbers."""
+    first, both = plain([A], 400 * before), plain([A, C], 400 * after)
+    tried = (first, plain([A, C], 400 * before)) if refused else (first,)
+    selection = Selection(plain([], 1e5), first, ("seen",), (0.0,), tried, {}, (A, C))
+    found, asked = SimpleNamespace(group="other", what="something varies"), []
+
+    def search(prepared, *, known, varied=False):
+        asked.append((prepared, known.best, varied))
+        return prepared, replace(known, best=both)
+
+    where = "torchrl_bayessim.diagnosis.with_chance."
+    monkeypatch.setattr(where + "varying", lambda *_: found)
+    monkeypatch.setattr(where + "with_variation", lambda *_: "wider")
+    monkeypatch.setattr(where + "_under_noise_alone", lambda *_: both)
+    prepared, more = _beside_variation(search, "as it was", selection, ())
+    alone = [("as it was", both, False)] if expected == "alone" else []
+    assert asked == [("wider", first, True), *alone]
+    assert prepared == ("wider" if expected == "beside" else "as it was")
+    assert more.best is (first if expected == "before" else both)
 
 
 def sampled(rng, steps, drag, jitter):
