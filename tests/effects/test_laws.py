@@ -297,6 +297,12 @@ def test_friction_laws():
     # gear 2 at the shoulder, a servo of gain 5 that is 1 rad off, gear −1 at the rail
     loads = forces("load_dependent_friction", 0.5, ctrl=(1.5, 1.0, 4.0))["dof_frictionloss"]
     assert loads == at([1.5, 2.5, 2.0, 0.0])
+    soft = {"ctrl": (1.5, 1.0, 4.0), "onset": 0.2}  # of it, begun over 0.2 rad/s
+    for speed in (0.0, 0.1, -0.1, 0.6):
+        begun = forces("load_dependent_friction", 0.5, qvel=speed, **soft)["dof_frictionloss"]
+        assert begun == at([s * (1 - math.exp(-abs(speed) / 0.2)) for s in (1.5, 2.5, 2.0, 0.0)])
+    with pytest.raises(ValueError, match="onset, a speed over which friction begins"):
+        effect("load_dependent_friction", onset=-0.1)
 
 
 def test_disturbances():

@@ -32,6 +32,7 @@ from .robot import Robot
 _PRESLIDING = 0.005  # rad or m
 _ONSET = 0.1  # rad/s or m/s
 _SLOWEST = 1e-6  # of that
+_SHOWS = 0.005  # change of an onset that may be none, rad/s or m/s
 
 
 class PreslidingFriction(ForceEffect):
@@ -148,19 +149,30 @@ class LoadDependentFriction(ForceEffect):
     outside: ``F = τ_motor + τ_bias``, with ``τ_bias`` what holds a robot against gravity, Coriolis
     and centrifugal forces (``qfrc_bias``). At joints without an actuator the load is the latter.
 
+    Or one that begins softly, as of greased teeth: ``s |F| (1 − e^{−|v| / v_0})``.
+
     Args:
         external: Whether the load counts forces from outside where there is an actuator, too.
+        onset: ``v_0``, rad/s or m/s; 0 for friction that is all there at once. A diagnosis fits it.
+
+    Raises:
+        ValueError: ``onset`` is below 0.
     """
 
     name, unit, group = "load_dependent_friction", "fraction", "friction"
 
-    def __init__(self, *, external: bool = False) -> None:
-        self.external = external
+    def __init__(self, *, external: bool = False, onset: float = 0.0) -> None:
+        check_number("onset, a speed over which friction begins", onset, least=0.0)
+        self.external, self.onset = external, onset
 
     def forms(self, seconds: float) -> tuple[Effect, ...]:
         """Return friction under the actuators' force, and under that from outside, too."""
         del seconds
         return LoadDependentFriction(), LoadDependentFriction(external=True)
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the speed of a soft beginning, up to a tenth of the largest."""
+        return {"onset": (max(_SHOWS, 0.05 * self.onset), 0.0, max(0.1 * reach.velocity, _ONSET))}
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the names of the joints, none if no actuator moves one."""
@@ -185,7 +197,10 @@ class LoadDependentFriction(ForceEffect):
         load, weighed = now.load, strength[..., outside].any(-1)
         if weighed.any():  # what is outside takes as long as a time step
             load = load + torch.where(outside, now.bias_of(weighed), 0.0)
-        return {"frictionloss": strength * load.abs()}, memory
+        force = strength * load.abs()
+        if self.onset:  # of dry friction: a damping would be that of the speed before a reversal
+            force = force * -torch.expm1(-now.velocity.abs() / self.onset)
+        return {"frictionloss": force}, memory
 
 
 class DirectionalFriction(ForceEffect):
