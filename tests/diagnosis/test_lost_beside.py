@@ -1,6 +1,7 @@
 """Commands that are lost beside a law that lasts, where single losses are too small to be seen."""
 
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from test_diagnose import logs, system
 
 from torchrl_bayessim.diagnosis.chance import _of_one_place
 from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.with_chance import _beside_losses
 
 SOME = (
     "parallel_spring", "packet_drop", "sensor_dropout", "action_delay", "coulomb_friction",
@@ -63,3 +65,19 @@ def test_losses_that_several_drives_explain_alone_are_those_of_none(gains, kept)
     best = {unit: (300.0 - gains[unit.where], 0.1) for unit in units}
     best[PlainUnit("sensor_dropout", "sample", [0])] = (310.0, 0.1)
     assert {unit.where for unit in _of_one_place(best, 300.0)} == kept
+
+
+@pytest.mark.parametrize(
+    ("lost", "kept"), [(1, ("before", "selection", [], None)), (4, ("other", "more", ["dropout"]))]
+)
+def test_of_samples_that_are_decided_on_one_by_one_a_few_have_to_be_lost(monkeypatch, lost, kept):
+    sent = SimpleNamespace(lost=lost)
+    beside = SimpleNamespace(told=lambda: ("other", "more", ["dropout"], sent))
+    where = "torchrl_bayessim.diagnosis.with_chance."
+    monkeypatch.setattr(where + "beside_lost_commands", lambda _: None)
+    monkeypatch.setattr(where + "beside_lost_samples", lambda _: beside)
+    sought = SimpleNamespace(selection="selection", found=["as it seemed"])
+    assert _beside_losses("before", sought) == (kept if lost < 4 else (*kept, sent))
+    monkeypatch.setattr(where + "beside_lost_samples", lambda _: None)
+    nothing = "before", "selection", ["as it seemed"], None
+    assert _beside_losses("before", sought) == nothing

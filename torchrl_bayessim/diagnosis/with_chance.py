@@ -16,14 +16,14 @@ from .beside_jitter import beside_jitter, outdone
 from .beside_losses import Sought
 from .chance import Chance, chances, detectable, of_chance, unseen
 from .holds import Hold
-from .loss_suspects import Suspects
+from .loss_suspects import FEWEST, Suspects
 from .losses import losses, may_be_beside
 from .lost_commands import beside_lost_commands
 from .lost_samples import beside_lost_samples
 from .model import WHITE, Model, judged_fits, takes_most
 from .objective import Unit
 from .preparation import Prepared
-from .scatter import Recorded, Scatter, gap_with_holds
+from .scatter import Recorded, Scatter, Sent, gap_with_holds
 from .search import MANY
 from .selection import Selection
 from .varying import varying, with_variation
@@ -64,8 +64,7 @@ def with_chance(
         recorded = gap_with_holds(prepared, logs, selection)
     elif suspects:
         sought = Sought(seen, selection, found, suspects, search, generator)
-        if beside := beside_lost_commands(sought) or beside_lost_samples(sought):
-            prepared, selection, found, sent = beside.told()
+        prepared, selection, found, sent = _beside_losses(prepared, sought)
     if not holds and sent is None and _may_be_jitter(suspects, found, units):
         shaken = beside_jitter(seen, selection, units, search=search, generator=generator)
     if shaken is not None:
@@ -84,6 +83,20 @@ def with_chance(
     least = detectable(prepared.sets["train"], selection, random)
     hidden = [] if found else unseen(prepared.sets, selection, random)
     return prepared, selection, Scatter(found, least, holds, recorded, hidden, sent)
+
+
+def _beside_losses(
+    prepared: Prepared, sought: Sought
+) -> tuple[Prepared, Selection, Sequence[Chance], Sent | None]:
+    """Return what is found beside commands or samples that were lost; the same if it is no more.
+
+    Where hardly any of them is, once they are decided on one by one, none was lost.
+    """
+    beside = beside_lost_commands(sought) or beside_lost_samples(sought)
+    if beside is None:
+        return prepared, sought.selection, sought.found, None
+    told = beside.told()
+    return told if told[-1].lost >= FEWEST else (prepared, sought.selection, [], None)
 
 
 def _may_be_jitter(
