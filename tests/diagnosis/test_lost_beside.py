@@ -67,17 +67,20 @@ def test_losses_that_several_drives_explain_alone_are_those_of_none(gains, kept)
     assert {unit.where for unit in _of_one_place(best, 300.0)} == kept
 
 
-@pytest.mark.parametrize(
-    ("lost", "kept"), [(1, ("before", "selection", [], None)), (4, ("other", "more", ["dropout"]))]
-)
-def test_of_samples_that_are_decided_on_one_by_one_a_few_have_to_be_lost(monkeypatch, lost, kept):
-    sent = SimpleNamespace(lost=lost)
-    beside = SimpleNamespace(told=lambda: ("other", "more", ["dropout"], sent))
+@pytest.mark.parametrize(("lost", "taken"), [(1, False), (3, False), (4, True)])
+def test_of_samples_that_are_decided_on_one_by_one_a_few_have_to_be_lost(monkeypatch, lost, taken):
+    other, mine = (SimpleNamespace(unit=unit) for unit in ("another sensor", "sensor"))
+    told = "interpolated", "more", [mine], SimpleNamespace(lost=lost)
+    beside = SimpleNamespace(told=lambda: told, chance=mine)
     where = "torchrl_bayessim.diagnosis.with_chance."
     monkeypatch.setattr(where + "beside_lost_commands", lambda _: None)
     monkeypatch.setattr(where + "beside_lost_samples", lambda _: beside)
-    sought = SimpleNamespace(selection="selection", found=["as it seemed"])
-    assert _beside_losses("before", sought) == (kept if lost < 4 else (*kept, sent))
+    sought = SimpleNamespace(selection="selection", found=[mine, other])
+    before = "before", "selection", [other], None
+    assert _beside_losses("before", sought) == (told if taken else before)
+    # commands that stay the same show no loss, however many are lost
+    monkeypatch.setattr(where + "beside_lost_commands", lambda _: beside)
+    assert _beside_losses("before", sought) == told
+    monkeypatch.setattr(where + "beside_lost_commands", lambda _: None)
     monkeypatch.setattr(where + "beside_lost_samples", lambda _: None)
-    nothing = "before", "selection", ["as it seemed"], None
-    assert _beside_losses("before", sought) == nothing
+    assert _beside_losses("before", sought) == ("before", "selection", [mine, other], None)

@@ -191,29 +191,33 @@ def test_beside_losses_that_were_found_alone_more_is_looked_for(monkeypatch, bes
 
 
 @pytest.mark.parametrize(
-    ("effects", "left", "calm", "cost", "again"),
+    ("effects", "left", "calm", "cost", "beside", "again"),
     [
-        ([A], 1.1, True, 700.0, False),
-        ([], 1.1, True, 700.0, True),  # nothing else was found
-        ([A], 1.3, True, 700.0, True),  # what was leaves more than noise
-        ([A], 1.1, False, 700.0, True),  # some segments hold more than noise
-        ([A], 1.1, True, 400.0, True),  # losses explain two thirds of what it does
+        ([A], 1.1, True, 700.0, 100.0, False),
+        ([], 1.1, True, 700.0, 100.0, True),  # nothing else was found
+        ([A], 1.3, True, 700.0, 100.0, True),  # what was leaves more than noise
+        ([A], 1.1, False, 700.0, 100.0, True),  # some segments hold more than noise
+        ([A], 1.1, True, 400.0, 100.0, True),  # losses explain two thirds of what it does
+        ([A], 1.1, True, 700.0, -50.0, True),  # or much beside it
     ],
 )
 def test_losses_that_explain_far_less_than_effects_are_not_fitted_again(
-    monkeypatch, *, effects, left, calm, cost, again
+    monkeypatch, *, effects, left, calm, cost, beside, again
 ):
     """Of 1000 that parameters leave, the effect takes 900."""
     (unit,) = units_of([PacketDrop()], system().robot)
     where, asked = "torchrl_bayessim.diagnosis.evident_losses.", []
-    law = SimpleNamespace(deviance=lambda _: cost)
+    law = SimpleNamespace(deviance=lambda judged: judged[0])
     monkeypatch.setattr(where + "likeliest", lambda *_, **__: law)
     monkeypatch.setattr(where + "_plain", lambda *_: False)
     monkeypatch.setattr(where + "_fitted_again", lambda *_: asked.append(1))
-    data = dict.fromkeys(("train", "validation"), SimpleNamespace(tried=lambda _: None))
+    data, best = (
+        dict.fromkeys(("train", "validation"), SimpleNamespace(tried=lambda _, left=left: left))
+        for left in (cost, beside)
+    )
     alone = SimpleNamespace(law=SimpleNamespace(size=16), costs=[600.0, 400.0])
     rival = SimpleNamespace(law=SimpleNamespace(size=16), costs=[60.0, 40.0], calm=calm)
-    suspects = SimpleNamespace(units=[unit], nominal=data, best=data, alone=alone, rival=rival)
+    suspects = SimpleNamespace(units=[unit], nominal=data, best=best, alone=alone, rival=rival)
     selection = SimpleNamespace(best=plain(effects, 400 * left))
     sought = SimpleNamespace(suspects=suspects, selection=selection, found=[])
     assert evident(sought) is None

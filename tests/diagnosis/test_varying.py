@@ -113,7 +113,8 @@ def test_a_model_without_effects_varies_in_nothing():
         (10.0, 3.0, False, "beside"),
         (10.0, 3.0, True, "before"),  # a little of everything helps
         (10.0, 8.0, True, "beside"),
-        (1.15, 1.0, False, "beside"),  # there was little to explain
+        (10.0, 1.0, False, "dropped"),  # the search takes it out again
+        (10.0, 1.0, True, "refused"),
     ],
 )
 def test_what_leaves_noise_alone_without_a_variation_stands_in_its_place(
@@ -125,19 +126,22 @@ def test_what_leaves_noise_alone_without_a_variation_stands_in_its_place(
     selection = Selection(plain([], 1e5), first, ("seen",), (0.0,), tried, {}, (A, C))
     found, asked = SimpleNamespace(group="other", what="something varies"), []
 
+    gone = expected in {"dropped", "refused"}
+
     def search(prepared, *, known, varied=False):
         asked.append((prepared, known.best, varied))
-        return prepared, replace(known, best=both)
+        return prepared, replace(known, best=both if varied or not gone else first)
 
     where = "torchrl_bayessim.diagnosis.with_chance."
     monkeypatch.setattr(where + "varying", lambda *_: found)
     monkeypatch.setattr(where + "with_variation", lambda *_: "wider")
     monkeypatch.setattr(where + "_under_noise_alone", lambda *_: both)
     prepared, more = _beside_variation(search, "as it was", selection, ())
-    alone = [("as it was", both, False)] if expected == "alone" else []
+    alone = [("as it was", both, False)] if expected == "alone" or gone else []
     assert asked == [("wider", first, True), *alone]
-    assert prepared == ("wider" if expected == "beside" else "as it was")
-    assert more.best is (first if expected == "before" else both)
+    assert prepared == ("wider" if expected in {"beside", "dropped"} else "as it was")
+    assert more.best is (first if expected in {"before", "refused"} else both)
+    assert (more is selection) == (expected in {"before", "refused"})
 
 
 def sampled(rng, steps, drag, jitter):

@@ -138,7 +138,12 @@ def test_only_those_that_are_asked_for_are_computed():
     assert asked[0].tolist() == [0, 2]
     np.testing.assert_array_equal(found[some], bias()[some])
     assert found[1].tolist() == [0.0, 0.0]
+    np.testing.assert_array_equal(now.bias_of(torch.tensor([1, 0, 1])), found)
+    asked.pop()
     # all of them are those that others have asked for, too
     np.testing.assert_array_equal(now.bias_of(torch.ones(3, dtype=torch.bool)), bias())
     np.testing.assert_array_equal(now.bias_of(some), now.qfrc_bias)
     assert len(asked) == 2
+
+    alone = BeforeStep(lambda: torch.ones(2), qpos=torch.zeros(2))  # one simulation, no batch
+    assert alone.bias_of(torch.tensor([True, False])).tolist() == [1.0, 1.0]

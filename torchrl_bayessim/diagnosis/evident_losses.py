@@ -76,7 +76,7 @@ def evident(sought: Sought) -> Evident | None:
 
     Or those that were found in the place of effects that last. Where none are plain, those that are
     in a simulator that is fitted again, first with parameters alone; but not where effects leave
-    noise alone, and losses most of what those explain.
+    noise alone, and losses leave most of what those explain.
 
     Args:
         sought: What was found, and short segments.
@@ -88,7 +88,7 @@ def evident(sought: Sought) -> Evident | None:
     bases += [(suspects.best, suspects.rival)] if best.units else []
     every = [[_likely(data, unit, alone) for unit in units] for data, alone in bases]
     plain = [one for part in every for one in part if one.plain or one.unit in known]
-    if not plain and not _outdone(sought, every[0]):
+    if not plain and not _far_behind(sought, every):
         sets = zip(every, bases, strict=True)
         again = (_fitted_again(sought, part, alone) for part, (_, alone) in sets)
         plain = list(islice(filter(None, again), 1))
@@ -99,20 +99,21 @@ def evident(sought: Sought) -> Evident | None:
     return Evident(seen.unit, seen.law, seen.data[JUDGED[0]].point, least, suspects.nominal)
 
 
-def _outdone(sought: Sought, found: Sequence[_Likely]) -> bool:
-    """Return whether effects that last leave noise alone, and losses most of what those explain.
+def _far_behind(sought: Sought, every: Sequence[Sequence[_Likely]]) -> bool:
+    """Return whether effects leave noise alone, and losses leave most of what those explain.
 
     Fitting again may make losses a little likelier, but it takes as long as a search.
 
     Args:
         sought: What was found.
-        found: Losses of every unit with parameters alone.
+        every: Losses of each unit with parameters alone, and beside the effects if there are any.
     """
     suspects, best = sought.suspects, sought.selection.best
     if not best.units or not suspects.rival.calm or best.mean_square >= WHITE:
         return False
+    alone, beside = (max((one.gained for one in part), default=0.0) for part in every)
     explained = sum(suspects.alone.costs) - sum(suspects.rival.costs)
-    return max((one.gained for one in found), default=0.0) < _MOST * explained
+    return alone < _MOST * explained and beside < EVIDENT
 
 
 def _likely(data: Mapping[str, LossSegments], unit: Unit, alone: Alone) -> _Likely:

@@ -16,11 +16,11 @@ from .beside_jitter import beside_jitter, outdone
 from .beside_losses import Sought
 from .chance import Chance, chances, detectable, of_chance, unseen
 from .holds import Hold
-from .loss_suspects import FEWEST, Suspects
+from .loss_suspects import Suspects
 from .losses import losses, may_be_beside
 from .lost_commands import beside_lost_commands
 from .lost_samples import beside_lost_samples
-from .model import WHITE, Model, judged_fits, takes_most
+from .model import WHITE, Model, judged_fits, shown, takes_most
 from .objective import Unit
 from .preparation import Prepared
 from .scatter import Recorded, Scatter, Sent, gap_with_holds
@@ -30,6 +30,7 @@ from .varying import varying, with_variation
 
 Search = Callable[..., tuple[Prepared, Selection]]
 _AGAIN = 4  # steps of fits whose noise was another
+_LOST = 4  # samples of all runs, to be lost at all
 _REST = "{}, as it seems: that explains what remains"
 
 
@@ -90,13 +91,19 @@ def _beside_losses(
 ) -> tuple[Prepared, Selection, Sequence[Chance], Sent | None]:
     """Return what is found beside commands or samples that were lost; the same if it is no more.
 
-    Where hardly any of them is, once they are decided on one by one, none was lost.
+    Samples that are decided on one by one, of which hardly any is lost, are none that were lost.
     """
-    beside = beside_lost_commands(sought) or beside_lost_samples(sought)
+    beside = beside_lost_commands(sought)
+    if beside is not None:
+        return beside.told()
+    beside = beside_lost_samples(sought)
     if beside is None:
         return prepared, sought.selection, sought.found, None
     told = beside.told()
-    return told if told[-1].lost >= FEWEST else (prepared, sought.selection, [], None)
+    if told[-1].lost >= _LOST:
+        return told
+    others = [one for one in sought.found if one.unit != beside.chance.unit]
+    return prepared, sought.selection, others, None
 
 
 def _may_be_jitter(
@@ -135,8 +142,10 @@ def _beside_variation(
         return prepared.alarmed(_REST.format(found.what)) if rest else prepared, selection
     plain = _under_noise_alone(prepared, more.best)
     instead = takes_most(selection.best, plain)
-    if instead and plain.mean_square < WHITE <= selection.best.mean_square:
-        return search(prepared, known=replace(selection, best=plain))
+    if instead and plain.mean_square < WHITE and shown(selection.best, plain):
+        _, again = search(prepared, known=replace(selection, best=plain))
+        if again.best.names > selection.best.names and again.best.mean_square < WHITE:
+            return prepared, again
     refused = any(more.best.names <= model.names for model in selection.tried)
     # what explains that without a variation and was refused stands in its place, not beside it:
     # where something varies a little of everything helps

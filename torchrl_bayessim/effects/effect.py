@@ -54,8 +54,8 @@ Now = SimpleNamespace
 uniform numbers in [0, 1) of this control step, as many as there are targets, for random effects.
 For forces, in joint order: ``position`` and ``velocity`` ``(*batch, J)``, and ``load``, the
 generalised force that actuators exert ``(*batch, J)``, and ``bias``, what holds them against
-gravity, Coriolis and centrifugal forces ``(*batch, J)``, of which ``bias_of(some)`` computes those
-of some simulations ``(*batch,)`` and gives 0 for all others; in actuator order: ``command``,
+gravity, Coriolis and centrifugal forces ``(*batch, J)``, or ``bias_of(some)``, in which only those
+simulations ``(*batch,)`` count, and which takes less time; in actuator order: ``command``,
 ``actuator_velocity``, ``actuator_force``, ``demanded_force``, which is the same without limits, and
 ``actuator_gain``, the force per unit of command ``(*batch, A)``; and ``timestep``, the seconds that
 a force is held (a float).

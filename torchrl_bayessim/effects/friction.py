@@ -32,7 +32,7 @@ from .robot import Robot
 _PRESLIDING = 0.005  # rad or m
 _ONSET = 0.1  # rad/s or m/s
 _SLOWEST = 1e-6  # of that
-_SHOWS = 0.005  # change of an onset that may be none, rad/s or m/s
+_SHARP = 0.005  # rad/s or m/s: an onset that no time step resolves
 
 
 class PreslidingFriction(ForceEffect):
@@ -153,7 +153,8 @@ class LoadDependentFriction(ForceEffect):
 
     Args:
         external: Whether the load counts forces from outside where there is an actuator, too.
-        onset: ``v_0``, rad/s or m/s; 0 for friction that is all there at once. A diagnosis fits it.
+        onset: ``v_0``, rad/s or m/s; friction is all there at once below 0.005, which no time step
+            resolves. A diagnosis fits it.
 
     Raises:
         ValueError: ``onset`` is below 0.
@@ -171,8 +172,9 @@ class LoadDependentFriction(ForceEffect):
         return LoadDependentFriction(), LoadDependentFriction(external=True)
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
-        """Return the speed of a soft beginning, up to a tenth of the largest."""
-        return {"onset": (max(_SHOWS, 0.05 * self.onset), 0.0, max(0.1 * reach.velocity, _ONSET))}
+        """Return the speed of a soft beginning, up to a tenth of the largest, or to that it has."""
+        most = max(0.1 * reach.velocity, _ONSET, self.onset)
+        return {"onset": (max(_SHARP, 0.05 * self.onset), 0.0, most)}
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the names of the joints, none if no actuator moves one."""
@@ -198,7 +200,7 @@ class LoadDependentFriction(ForceEffect):
         if weighed.any():  # what is outside takes as long as a time step
             load = load + torch.where(outside, now.bias_of(weighed), 0.0)
         force = strength * load.abs()
-        if self.onset:  # of dry friction: a damping would be that of the speed before a reversal
+        if self.onset >= _SHARP:  # as dry friction: a damping exceeds it where a step reverses
             force = force * -torch.expm1(-now.velocity.abs() / self.onset)
         return {"frictionloss": force}, memory
 

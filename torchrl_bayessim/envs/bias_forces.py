@@ -42,12 +42,17 @@ class BeforeStep(Readings):
         return self._bias()
 
     def bias_of(self, some: Tensor) -> Tensor:
-        """Return ``qfrc_bias`` of some simulations, shape ``(*batch,)``, and 0 of all others.
+        """Return ``qfrc_bias`` of some simulations, and of others the same or 0.
 
-        It takes nearly as long as a time step where all are asked for.
+        Of all it takes nearly as long as a time step.
+
+        Args:
+            some: Which are asked for, booleans of shape ``(*batch,)``.
         """
-        if "qfrc_bias" in vars(self) or some.ndim != 1 or bool(some.all()):
+        one_batch = self.qpos.ndim == 2 and some.shape == self.qpos.shape[:1]
+        if "qfrc_bias" in vars(self) or not one_batch or bool(some.all()):
             return self.qfrc_bias
+        some = some.bool()
         found = self._bias(some.nonzero()[:, 0].numpy())
         forces = found.new_zeros(len(some), found.shape[1])
         forces[some] = found
