@@ -130,7 +130,8 @@ def test_what_leaves_noise_alone_without_a_variation_stands_in_its_place(
 
     def search(prepared, *, known, varied=False):
         asked.append((prepared, known.best, varied))
-        return prepared, replace(known, best=both if varied or not gone else first)
+        best = both if varied or not gone else first
+        return prepared if varied else "with its alarms", replace(known, best=best)
 
     where = "torchrl_bayessim.diagnosis.with_chance."
     monkeypatch.setattr(where + "varying", lambda *_: found)
@@ -139,7 +140,8 @@ def test_what_leaves_noise_alone_without_a_variation_stands_in_its_place(
     prepared, more = _beside_variation(search, "as it was", selection, ())
     alone = [("as it was", both, False)] if expected == "alone" or gone else []
     assert asked == [("wider", first, True), *alone]
-    assert prepared == ("wider" if expected in {"beside", "dropped"} else "as it was")
+    where = {"alone": "with its alarms", "beside": "wider", "dropped": "wider"}
+    assert prepared == where.get(expected, "as it was")
     assert more.best is (first if expected in {"before", "refused"} else both)
     assert (more is selection) == (expected in {"before", "refused"})
 

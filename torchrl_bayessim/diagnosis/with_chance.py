@@ -143,9 +143,9 @@ def _beside_variation(
     plain = _under_noise_alone(prepared, more.best)
     instead = takes_most(selection.best, plain)
     if instead and plain.mean_square < WHITE and shown(selection.best, plain):
-        _, again = search(prepared, known=replace(selection, best=plain))
+        alike, again = search(prepared, known=replace(selection, best=plain))
         if again.best.names > selection.best.names and again.best.mean_square < WHITE:
-            return prepared, again
+            return alike, again
     refused = any(more.best.names <= model.names for model in selection.tried)
     # what explains that without a variation and was refused stands in its place, not beside it:
     # where something varies a little of everything helps
