@@ -227,7 +227,7 @@ def _sticking(
     if not mine or best.names & {u.name for u in dry} or best.dispersion() < _MORE:
         return []
     more = {unit: unit.inside(_LITTLE * unit.high) for unit in dry}
-    start = Point(best.fit.point.z, {**best.fit.point.strengths, **more})
+    start = best.fit.point.beside(more)
     return judged_fits(*sets, [start])
 
 
@@ -265,8 +265,7 @@ def stands_in(model: Model, kept: Collection[Unit], name: str) -> bool:
 
 def _with_each(base: Model, additions: Iterable[Mapping[Unit, float]]) -> list[Point]:
     """Return the base with each addition."""
-    point = base.fit.point
-    return [Point(point.z, {**point.strengths, **more}) for more in additions]
+    return [base.fit.point.beside(more) for more in additions]
 
 
 def _raced(sets: tuple[Objective, Objective], starts: Sequence[Point], best: Model) -> list[Model]:

@@ -181,7 +181,7 @@ def _likeliest(
     judged: Sequence[Judged], point: Point, rows: Sequence[tuple[Unit, float]]
 ) -> dict[Unit, tuple[float, float]]:
     """Return the least deviance of each unit over strengths, and the strength that has it."""
-    told = _told(judged, [_with(point, unit, strength) for unit, strength in rows])
+    told = _told(judged, [point.beside({unit: strength}) for unit, strength in rows])
     best: dict[Unit, tuple[float, float]] = {}
     for (unit, strength), one in zip(rows, told, strict=True):
         best[unit] = min(best.get(unit, (np.inf, 0.0)), (one.cost, strength))
@@ -235,7 +235,7 @@ def _refined(
     """
     strengths = np.array([1.0, *_AROUND]) * strength
     strengths = np.unique(np.minimum(strengths, unit.high))
-    points = [_with(point, unit, float(s)) for s in strengths]
+    points = [point.beside({unit: float(s)}) for s in strengths]
     told = _told(judged, points)
     costs = np.array([one.cost for one in told])
     best = int(np.argmin(costs))
@@ -270,10 +270,6 @@ def _of_one_place(
         if len(gains) > 1 and gains[-2] > _ELSEWHERE * gains[-1]:
             kept = {unit: told for unit, told in kept.items() if unit.name != name}
     return kept
-
-
-def _with(point: Point, unit: Unit, strength: float) -> Point:
-    return Point(point.z, {**point.strengths, unit: strength})
 
 
 def _error(logs: Array, costs: Array) -> float:

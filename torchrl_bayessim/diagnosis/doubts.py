@@ -17,7 +17,7 @@ from ..effects.transmission import servo_damping
 from ..effects.units import slides
 from .cells import plain
 from .model import Model, as_good, judged_fits
-from .objective import Point, Unit
+from .objective import Unit
 from .preparation import Prepared
 from .report import Finding
 
@@ -90,7 +90,7 @@ def unsigned(best: Model, prepared: Prepared) -> list[str]:
     """
     point, robot = best.fit.point, prepared.predictor.system.robot
     signed = [unit for unit in best.units if unit.low < 0 and point.strengths[unit]]
-    others = [Point(point.z, {**point.strengths, u: -point.strengths[u]}) for u in signed]
+    others = [point.beside({u: -point.strengths[u]}) for u in signed]
     train, validation = prepared.sets["train"], prepared.sets["validation"]
     mirrored = judged_fits(train, validation, others, iterations=0)
     sizes = [abs(unit.actual(point.strengths[unit])) for unit in signed]

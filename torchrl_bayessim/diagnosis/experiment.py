@@ -123,7 +123,7 @@ def _whole(unit: Unit) -> bool:
 def _untested(selection: Selection, units: Sequence[Unit]) -> list[_Question]:
     fit, questions = selection.best.fit, {}
     for unit in units:
-        point = Point(fit.point.z, {**fit.point.strengths, unit: _LEVEL * unit.high})
+        point = fit.point.beside({unit: _LEVEL * unit.high})
         pair = (unit.name, "nothing")
         questions.setdefault(pair, _Question(pair, point, fit))
     return list(questions.values())

@@ -120,7 +120,7 @@ def _starts(now: Round) -> tuple[list[Point], list[Fit | None]]:
     base, seen = now.base, now.seen
     additions = [*singles(seen), *pairs(seen), *groups(seen)]
     thin = base.take(now.index)
-    starts = [Point(base.point.z, {**base.point.strengths, **on}) for on in additions]
+    starts = [base.point.beside(on) for on in additions]
     origins = [now.coarse.origin(thin, list(on)) for on in additions]
     if base.units or len(base.point.z) == 1 or not bent(base):
         return starts, origins

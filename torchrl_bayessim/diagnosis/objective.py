@@ -153,6 +153,10 @@ class Point:
     z: Array
     strengths: Mapping[Unit, float] = field(default_factory=dict)
 
+    def beside(self, others: Mapping[Unit, float]) -> Point:
+        """Return the point with other strengths beside its own, or in the place of those."""
+        return Point(self.z, {**self.strengths, **others})
+
 
 class Objective:
     """Evaluates points on segments.

@@ -75,7 +75,7 @@ class Fit:
 
     def beside(self, unit: Unit) -> Fit:
         """Return the fit with one more unit at zero, of which nothing is known yet."""
-        point = Point(self.point.z, {**self.point.strengths, unit: 0.0})
+        point = self.point.beside({unit: 0.0})
         jacobian = np.c_[self.jacobian, np.zeros(len(self.jacobian))]
         return Fit(point, (*self.units, unit), self.innovations, jacobian)
 

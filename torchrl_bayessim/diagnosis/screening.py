@@ -158,7 +158,7 @@ class Screen:
             row = max(rows, key=lambda i: self.scores[i])
             relative = self.strengths[row] / unit.high
             columns.append(self.changes[row].reshape(-1, 1) / relative)
-        point = Point(fit.point.z, {**fit.point.strengths, **dict.fromkeys(added, 0.0)})
+        point = fit.point.beside(dict.fromkeys(added, 0.0))
         return Fit(point, tuple(point.strengths), fit.innovations, np.concatenate(columns, 1))
 
     def grown(self, every: int) -> Screen:

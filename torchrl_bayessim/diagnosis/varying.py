@@ -128,8 +128,8 @@ def _wavering(sets: Mapping[str, Objective], point: Point, unit: Unit) -> list[V
 
 def _change(objective: Objective, point: Point, unit: Unit) -> Array:
     """Return what a unit changes altogether, as far as a small part of it tells, ``(S, M)``."""
-    less = {**point.strengths, unit: (1 - _STEP) * point.strengths[unit]}
-    now, before = objective.unweighted([point, Point(point.z, less)])
+    less = point.beside({unit: (1 - _STEP) * point.strengths[unit]})
+    now, before = objective.unweighted([point, less])
     return np.asarray((now - before) / _STEP, dtype=np.float64)
 
 
@@ -159,8 +159,8 @@ def _by_rows(objective: Objective, point: Point, unit: Unit, step: float) -> Arr
     begin = np.zeros((3, len(segments), 2 * predictor.tangent.size))
     if ahead is not None:
         begin[2][:, predictor.sensing.channels] = ahead[0, :, segments.history]
-    more = {**point.strengths, unit: point.strengths.get(unit, 0.0) + step}
-    points = [point, Point(point.z, more), point]
+    more = point.beside({unit: point.strengths.get(unit, 0.0) + step})
+    points = [point, more, point]
     before, after, begun = objective.raw(points, segments.freed(begin))
     start = (begun - before) / step
     change = (after - before) / step - start
@@ -176,7 +176,7 @@ def _by_rows(objective: Objective, point: Point, unit: Unit, step: float) -> Arr
 def _drawn(sets: Mapping[str, Objective], point: Point, unit: Unit) -> list[Varying]:
     """Return an effect of chance at several strengths."""
     strengths, found = [level * unit.high for level in _LEVELS], []
-    points = [Point(point.z, {**point.strengths, unit: strength}) for strength in strengths]
+    points = [point.beside({unit: strength}) for strength in strengths]
     draws = {name: drawn(one, points, _DRAWS) for name, one in sets.items()}
     for i, strength in enumerate(strengths):
         what = f"commands come late by up to {strength:.2g} {unit.effect.unit} more at {unit.where}"
