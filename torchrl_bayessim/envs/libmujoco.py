@@ -9,6 +9,7 @@ meet a fatal error, are `guarded`.
 from __future__ import annotations
 
 __all__ = [
+    "address_of",
     "compiled",
     "doubles",
     "integers",
@@ -45,6 +46,11 @@ compiled = numba.njit(nogil=True, cache=True)
 
 _pointer = types.intp
 _numbers = types.CPointer(types.float64)
+
+
+def address_of(symbol: str) -> int:
+    """Return where a function or variable of the library is."""
+    return llvm.address_of_symbol(symbol)
 
 
 def _external(name: str, *arguments: types.Type) -> types.ExternalFunction:

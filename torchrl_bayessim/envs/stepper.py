@@ -27,6 +27,7 @@ from .drive import Drive, Resolved, resolved
 from .fatal_errors import fault_text
 from .model_batch import ModelBatch
 from .threads import Threads
+from .untimed import untimed
 from .worker import Worker, layout
 
 _SIGNATURE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -254,13 +255,14 @@ class Stepper:
             calls.append((owned, batch, *shared))
         own = calls[:1] if meanwhile is None else []
         others = calls[len(own) :]
-        self._running = [self._pool.submit(_seconds, kernel, *call) for call in others]
-        try:
-            spent = sum(_seconds(kernel, *call) for call in own)
-            if meanwhile is not None:
-                meanwhile()
-        finally:  # they write to the states
-            wait(self._running)
+        with untimed():
+            self._running = [self._pool.submit(_seconds, kernel, *call) for call in others]
+            try:
+                spent = sum(_seconds(kernel, *call) for call in own)
+                if meanwhile is not None:
+                    meanwhile()
+            finally:  # they write to the states
+                wait(self._running)
         spent += sum(future.result() for future in self._running)
         if steps:
             self._pace = spent / steps
