@@ -7,7 +7,11 @@ import pytest
 from plain_models import A, C, Unit, plain
 
 from torchrl_bayessim.diagnosis import further_effects
-from torchrl_bayessim.diagnosis.further_effects import identified, stands_apart
+from torchrl_bayessim.diagnosis.further_effects import (
+    beside_variation,
+    identified,
+    stands_apart,
+)
 
 
 @pytest.mark.parametrize(
@@ -216,3 +220,22 @@ def test_two_kinds_that_show_elsewhere_alike_stand_not_apart():
     both = {SENSOR: 60.0, Unit("gain", "hip"): 50.0}
     assert not stands_apart(base, screened(both)[0], "robot")
     assert not stands_apart(base, screened({SPRING: 900.0})[0], "robot")
+
+
+@pytest.mark.parametrize(
+    ("there", "left", "added"),
+    [([A], 1900.0, True), ([A, C], 1900.0, False), ([A, C], 450.0, True)],
+    ids=["a second effect", "a third of little", "a third of some share"],
+)
+def test_a_third_effect_beside_a_variation_is_a_share_of_the_gap(there, left, added):
+    """Of a gap of 100,000 a thousandth or hardly two hundredths are gone with it."""
+    last = Unit("timing", "hip")
+    start, base, better = plain([], 1e5), plain(there, 2000.0), plain([*there, last], left)
+    assert beside_variation(start, base, better, [better]) == added
+
+
+def test_what_another_kind_mends_as_well_is_no_effect_beside_a_variation():
+    start, base, better = plain([], 1e5), plain([A], 2e4), plain([A, C], 4000.0)
+    other = plain([A, Unit("delay", "x")], 3990.0, flipped=True)
+    assert beside_variation(start, base, better, [better])
+    assert not beside_variation(start, base, better, [better, other])

@@ -9,6 +9,7 @@ under another name, and stands beside it as its rival.
 from __future__ import annotations
 
 __all__ = [
+    "beside_variation",
     "identified",
     "no_rival",
     "nothing_left",
@@ -210,6 +211,19 @@ def no_rival(base: Model, better: Model, models: Sequence[Model], **_: object) -
     Where what varies counts as noise, what is left says nothing of how much is missing.
     """
     return not base.units or not _rivalled(base, better, models)
+
+
+def beside_variation(
+    start: Model, base: Model, better: Model, models: Sequence[Model], **_: object
+) -> bool:
+    """Return whether an effect is more than a stopgap for a variation that is not quite known.
+
+    It has no rival; and beside two effects, whose forms leave a little as well, it is some share of
+    the gap.
+    """
+    alone, before, after = (m.mean_square for m in (start, base, better))
+    little = before - after < _REMAINS * (alone - 1.0)
+    return no_rival(base, better, models) and not (little and len(base.names) > 1)
 
 
 def _rivalled(base: Model, better: Model, models: Sequence[Model]) -> bool:

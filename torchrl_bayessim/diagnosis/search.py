@@ -23,7 +23,7 @@ from .elimination import eliminated, without_stopgaps
 from .explanations import Round, bent, compare, explanations
 from .form_fit import softened, with_fitted_forms, with_forms_anew
 from .free_numbers import priced
-from .further_effects import identified, no_rival, nothing_left, stands_apart
+from .further_effects import beside_variation, identified, nothing_left, stands_apart
 from .little_left import all_of_little, little_left, one_alone
 from .model import (
     WHITE,
@@ -92,7 +92,7 @@ class Search:
         self.sets, self.start, self.offered = (train, validation), start, offered
         self.again, self.shapes, self.alpha, self.varied = again, shapes, alpha, varied
         self.generator, self.progress = generator, progress
-        self.worth = no_rival if varied else _worth(start, train)
+        self.worth = partial(beside_variation, start) if varied else _worth(start, train)
         self.units: Sequence[Unit] = offered
         self.tried, self.screens, self.p_values = [start], list[Screen](), list[float]()
 
