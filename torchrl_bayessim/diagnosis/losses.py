@@ -14,16 +14,17 @@ __all__ = ["EVIDENT", "SHARES", "WRONG", "found_beside", "losses", "may_be_besid
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..effects.action import ActionDelay, PacketDrop
 from ..effects.contacts import ContactFriction
-from ..effects.sensors import SensorBias
+from ..effects.sensors import SensorBias, SensorDropout
 from .chance import Chance
 from .contacts import resting
-from .loss_law import LossLaw, Told, likeliest
+from .loss_law import LossLaw, Told, Tried, likeliest
 from .loss_segments import LossSegments
 from .loss_suspects import (
     FEWEST,
@@ -52,6 +53,7 @@ _FEW = 0.1  # of the deviance that such losses explain: what they may cost in ru
 _BIASED = 0.1  # of the excess of the segments concerned, which parameters leave in all
 _OTHERS = 1 / 6  # of the segments that something else may have spoiled
 _REMAIN = 0.6  # or of those that were spoiled without losses
+_LONE = 0.2  # of what lost samples of a sensor explain, by those of any other
 EVIDENT, WRONG = 100.0, 0.3  # deviance, to be evident, and segments that losses do not explain
 _LATE = ActionDelay.group
 _INTERVAL = 3.92  # standard deviations that are 95 %
@@ -108,7 +110,8 @@ def may_be_beside(unit: Unit, others: Sequence[Unit]) -> bool:
 def _sensed(others: Sequence[Unit]) -> bool:
     """Return whether effects are late, or of sensors and more than a constant or a slow drift.
 
-    Samples err with these as if a few were lost; they have to be clearly.
+    Samples err with these as if a few were lost; they have to be clearly, or of one sensor alone:
+    what is not quite the true delay, or gain, errs in all that moves.
     """
     known = [unit.effect for unit in others]
     sensing = any(e.channel == "sensing" and e.group != SensorBias.group for e in known)
@@ -121,7 +124,13 @@ def _all_found(
     alone: Alone,
     others: Sequence[Unit] = (),
 ) -> list[Chance]:
-    found = [found_beside(data, unit, alone, others) for unit in units]
+    likely = [_Likely.of(data, unit, alone) for unit in units]
+    gains = [one.gain if isinstance(one.unit.effect, SensorDropout) else 0.0 for one in likely]
+    most = [max(gains[:i] + gains[i + 1 :], default=0.0) for i in range(len(gains))]
+    found = [
+        one.explaining(alone, others, lone=len(gains) > 1 and rest < _LONE * one.gain)
+        for one, rest in zip(likely, most, strict=True)
+    ]
     return [one for one in found if one is not None]
 
 
@@ -157,51 +166,79 @@ def found_beside(
     plausible, and to be evident: a force law that is not quite the true one errs everywhere a
     little, as if ever so many of them were.
     """
-    tried, base = {name: one.tried(unit) for name, one in data.items()}, alone.law
-    judged = [tried[name] for name in JUDGED]
-    scatters = [s for s in SCATTER.tolist() if s <= base.scatter][-3:]
-    law = likeliest(judged, SHARES, scatters, SPOILED, size=base.size)
-    gains = [cost - law.deviance([one]) for cost, one in zip(alone.costs, judged, strict=True)]
-    if sum(gains) < _NEEDED:
-        return None
-    told = {name: law.told(one) for name, one in tried.items()}
-    known = Told.joined([told[name] for name in JUDGED])
-    if not _explain(law, known, gains, alone=alone, unit=unit, others=others):
-        return None
-    share, low, high = np.minimum(law.share_within(judged), unit.high)
-    shown = told["test"]
-    if (shown.lost > LIKELIER).sum() < FEWEST:  # so rare that test runs have hardly any
-        shown = Told.joined(list(told.values()))
-    sound = shown.spoiled <= LIKELIER
-    return Chance(
-        unit=unit,
-        strength=float(share),
-        error=_WIDER * float(high - low) / _INTERVAL,
-        gain=sum(gains),
-        deviance=sum(alone.costs) - sum(gains),
-        left=shown.after[sound],
-        before=float(shown.before[sound].mean()),
-    )
+    return _Likely.of(data, unit, alone).explaining(alone, others)
+
+
+class _Likely(NamedTuple):
+    """The likeliest losses of a unit, and by how much they are likelier than none, by split."""
+
+    unit: Unit
+    law: LossLaw
+    tried: Mapping[str, Tried]
+    gains: Sequence[float]
+
+    @classmethod
+    def of(cls, data: Mapping[str, LossSegments], unit: Unit, alone: Alone) -> _Likely:
+        tried, base = {name: one.tried(unit) for name, one in data.items()}, alone.law
+        judged = [tried[name] for name in JUDGED]
+        scatters = [s for s in SCATTER.tolist() if s <= base.scatter][-3:]
+        law = likeliest(judged, SHARES, scatters, SPOILED, size=base.size)
+        gains = [cost - law.deviance([one]) for cost, one in zip(alone.costs, judged, strict=True)]
+        return cls(unit, law, tried, gains)
+
+    @property
+    def gain(self) -> float:
+        """In all."""
+        return sum(self.gains)
+
+    def explaining(
+        self, alone: Alone, others: Sequence[Unit], *, lone: bool = False
+    ) -> Chance | None:
+        """Return them as found if they explain what they spoil.
+
+        Args:
+            alone: The law without losses.
+            others: Effects that they are beside.
+            lone: Whether no other sensor seems to have lost samples, too.
+        """
+        law = self.law
+        if self.gain < _NEEDED:
+            return None
+        told = {name: law.told(one) for name, one in self.tried.items()}
+        known = Told.joined([told[name] for name in JUDGED])
+        if not _explain(self, known, alone=alone, others=others, lone=lone):
+            return None
+        judged = [self.tried[name] for name in JUDGED]
+        share, low, high = np.minimum(law.share_within(judged), self.unit.high)
+        shown = told["test"]
+        if (shown.lost > LIKELIER).sum() < FEWEST:  # so rare that test runs have hardly any
+            shown = Told.joined(list(told.values()))
+        sound = shown.spoiled <= LIKELIER
+        return Chance(
+            unit=self.unit,
+            strength=float(share),
+            error=_WIDER * float(high - low) / _INTERVAL,
+            gain=self.gain,
+            deviance=sum(alone.costs) - self.gain,
+            left=shown.after[sound],
+            before=float(shown.before[sound].mean()),
+        )
 
 
 def _explain(
-    law: LossLaw,
-    known: Told,
-    gains: Sequence[float],
-    *,
-    alone: Alone,
-    unit: Unit,
-    others: Sequence[Unit],
+    losses: _Likely, known: Told, *, alone: Alone, others: Sequence[Unit], lone: bool
 ) -> bool:
     """Return whether losses explain the segments that have them, and little else is wrong."""
+    law, gains, unit = losses.law, losses.gains, losses.unit
     concerned = known.lost > LIKELIER
     if concerned.sum() < FEWEST:
         return False
     before, after = (
         float((e[concerned] - law.scatter).mean()) for e in (known.before, known.after)
     )
-    clear = sum(gains) > EVIDENT and after < _CLEARLY * before
-    if _sensed(others) and not clear:
+    evident = losses.gain > EVIDENT
+    clear = evident and after < _CLEARLY * before
+    if _sensed(others) and not clear and not (evident and lone):
         return False
     surely = bool(others) and clear
     # where losses come in bursts, the runs that judge may have had hardly any
