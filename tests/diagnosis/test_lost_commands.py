@@ -145,7 +145,7 @@ def test_losses_alone_sit_in_the_actuation():
 def test_the_search_is_not_done_again_where_no_losses_are_evident(monkeypatch):
     """Friction whose law no effect has is wrong everywhere, and some of that looks like losses."""
 
-    def search(*_):
+    def search(*_, **__):
         pytest.fail("searched again")
 
     seen = []
@@ -260,7 +260,8 @@ def test_which_commands_arrived_is_decided_on_again_while_that_helps(monkeypatch
     """Before and after the effects of each search; of 400 numbers."""
     rounds = iter(found)
 
-    def search(_):
+    def search(_, *, pairs):
+        assert not pairs
         before, after, unit = next(rounds)
         best = plain([] if unit is None else [unit], 400 * after)
         return None, SimpleNamespace(nominal=plain([], 400 * before), best=best)

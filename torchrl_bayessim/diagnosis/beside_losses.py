@@ -35,7 +35,7 @@ class Sought:
     selection: Selection
     found: Sequence[Chance]
     suspects: Suspects
-    search: Callable[[Prepared], tuple[Prepared, Selection]]
+    search: Callable[..., tuple[Prepared, Selection]]
     generator: np.random.Generator
 
 

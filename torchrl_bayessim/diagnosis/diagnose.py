@@ -172,6 +172,7 @@ def _searched(
     progress: Callable[[str], None],
     known: Selection | None = None,
     varied: bool = False,
+    pairs: bool = True,
 ) -> tuple[Prepared, Selection]:
     """Search for effects that last; an alarm where sensors that are late had to be left out."""
     shapes = partial(_shapes, system, prepared, units)
@@ -187,6 +188,7 @@ def _searched(
         prepared.nominal,
         known=known,
         varied=varied,
+        pairs=pairs,
         shapes=shapes,
         alpha=_SURELY if varied else _ALPHA,
         generator=generator,

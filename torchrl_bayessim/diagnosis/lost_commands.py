@@ -84,7 +84,7 @@ def _searched(
     sent: Selection,
     seen: Evident,
     *,
-    search: Callable[[Prepared], tuple[Prepared, Selection]],
+    search: Callable[..., tuple[Prepared, Selection]],
     generator: np.random.Generator,
 ) -> tuple[Prepared, Selection] | None:
     """Return what is found on the commands that arrived, if that explains more than as sent."""
@@ -93,7 +93,8 @@ def _searched(
     for _ in range(_ROUNDS):
         logs = Arrivals(prepared, point, seen.actuators, law).decided(logs)
         again = with_other_logs(prepared, logs, generator=generator)
-        again, selection = search(again)
+        # what wrong decisions leave, two effects that explain little alone would mend, too
+        again, selection = search(again, pairs=False)
         if selection.best.mean_square >= least:
             break
         least, point = selection.best.mean_square, selection.best.fit.point

@@ -47,7 +47,8 @@ def beside_lost_samples(sought: Sought) -> Beside | None:
     renewal = _Renewal(prepared, best.unit, best.strength, sought.suspects.alone.law.size)
     known = selection.best if best.beside else selection.nominal
     logs = {name: renewal.of(part, known.fit.point) for name, part in prepared.logs.items()}
-    again, other = sought.search(with_other_logs(prepared, logs, generator=sought.generator))
+    renewed = with_other_logs(prepared, logs, generator=sought.generator)
+    again, other = sought.search(renewed, pairs=False)
     if not set(other.best.names) - set(known.names):
         return None
     data = {name: one.at(other.best.fit.point) for name, one in sought.suspects.nominal.items()}

@@ -86,6 +86,7 @@ def select(
     *,
     known: Selection | None = None,
     varied: bool = False,
+    pairs: bool = True,
     shapes: Callable[[Point], Sequence[Unit]] = lambda _: (),
     alpha: float = 0.01,
     generator: np.random.Generator,
@@ -100,6 +101,8 @@ def select(
         units: The effects to consider, at each of their targets.
         known: What was found before, with another noise: the search goes on from there.
         varied: Whether what varies counts as noise: less than white noise may still hold an effect.
+        pairs: Whether to look for two effects of which neither explains most alone, where more than
+            noise is left.
         shapes: Returns those among them that have a frequency or a step, as they are seen beside
             what is in the model already.
         alpha: Level of the test that anything is missing, in every round.
@@ -114,7 +117,7 @@ def select(
         shapes=shapes, alpha=alpha, generator=generator, progress=progress,
     )  # fmt: skip
     best, others = _settled(search, search.best())
-    two = search.or_two_others(best)
+    two = search.or_two_others(best) if pairs else best
     if two is not best:
         best, others = _settled(search, search.best(two))
     found = tuple(search.screens), tuple(search.p_values), tuple(search.tried), others

@@ -15,6 +15,8 @@ from contextlib import contextmanager
 
 from .libmujoco import address_of
 
+_clock = ctypes.c_void_p.from_address(address_of("mjcb_time"))
+
 
 @contextmanager
 def untimed() -> Iterator[None]:
@@ -23,10 +25,9 @@ def untimed() -> Iterator[None]:
     It is one for all of a process: what other threads step meanwhile is not timed, either. Threads
     may overlap: whoever took the clock returns it, unless there is another one by then.
     """
-    clock = ctypes.c_void_p.from_address(address_of("mjcb_time"))
-    taken, clock.value = clock.value, None
+    taken, _clock.value = _clock.value, None
     try:
         yield
     finally:
-        if clock.value is None:
-            clock.value = taken
+        if _clock.value is None:
+            _clock.value = taken
