@@ -12,6 +12,7 @@ from torchrl_bayessim.diagnosis.further_effects import (
     identified,
     stands_apart,
 )
+from torchrl_bayessim.diagnosis.search import Search
 
 
 @pytest.mark.parametrize(
@@ -224,14 +225,20 @@ def test_two_kinds_that_show_elsewhere_alike_stand_not_apart():
 
 @pytest.mark.parametrize(
     ("there", "left", "added"),
-    [([A], 1900.0, True), ([A, C], 1900.0, False), ([A, C], 450.0, True)],
+    [([A], 1900.0, True), ([A, C], 1020.0, False), ([A, C], 980.0, True)],
     ids=["a second effect", "a third of little", "a third of some share"],
 )
 def test_a_third_effect_beside_a_variation_is_a_share_of_the_gap(there, left, added):
-    """Of a gap of 100,000 a thousandth or hardly two hundredths are gone with it."""
+    """A hundredth of a gap of 100,000 beyond the noise, 400."""
     last = Unit("timing", "hip")
-    start, base, better = plain([], 1e5), plain(there, 2000.0), plain([*there, last], left)
+    start, base, better = plain([], 100_400.0), plain(there, 2000.0), plain([*there, last], left)
     assert beside_variation(start, base, better, [better]) == added
+    train = SimpleNamespace(predictor=SimpleNamespace(system=None))
+    search = Search(
+        train, None, start, [], again=None, varied=True, shapes=None, alpha=0.01,
+        generator=None, progress=None,
+    )  # fmt: skip
+    assert search.worth(base, better, [better], seen=None) == added
 
 
 def test_what_another_kind_mends_as_well_is_no_effect_beside_a_variation():

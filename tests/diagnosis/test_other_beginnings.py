@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from plain_models import A, C, Unit, plain
 from test_diagnose import ARM, logs, system
@@ -9,6 +10,10 @@ from test_search import Scripted
 
 from torchrl_bayessim.diagnosis import search as searching
 from torchrl_bayessim.diagnosis.diagnose import diagnose
+from torchrl_bayessim.diagnosis.objective import units_of
+from torchrl_bayessim.diagnosis.preparation import prepare
+from torchrl_bayessim.diagnosis.selection import select
+from torchrl_bayessim.effects.catalogue import effect
 
 SPRING, ROTOR, PAYLOAD, WAVE = (Unit(n) for n in ("spring", "rotor", "payload", "wave"))
 
@@ -134,3 +139,18 @@ def test_a_search_that_goes_on_from_two_has_as_many_rounds_less():
     search = Scripted(further, {})
     assert len(search.best().names) == 4
     assert len(search.best(further[names[0],]).names) == 4
+
+
+@pytest.mark.parametrize("pairs", [True, False])
+def test_two_others_are_looked_for_if_that_is_asked(monkeypatch, pairs):
+    asked = []
+    monkeypatch.setattr(
+        "torchrl_bayessim.diagnosis.search.Search.or_two_others",
+        lambda _, best: asked.append(best) or best,
+    )
+    system_, noise = system(), np.random.default_rng(0)
+    prepared = prepare(system_, logs(6), [], generator=noise)
+    sets = prepared.sets["train"], prepared.sets["validation"]
+    units = units_of([effect("armature")], system_.robot)
+    select(*sets, prepared.nominal, units, pairs=pairs, generator=noise)
+    assert len(asked) == pairs

@@ -68,6 +68,41 @@ def test_a_clock_that_came_meanwhile_stays(ball):
     assert timed(*ball)
 
 
+def test_a_clock_of_a_users_own_stays_and_is_asked(ball):
+    calls = []
+    mujoco.set_mjcb_time(lambda: calls.append(1) or 0.0)
+    try:
+        with untimed():
+            mujoco.mj_step(*ball)
+            assert calls
+            mujoco.set_mjcb_time(None)
+        mujoco.mj_step(*ball)  # nothing that was taken comes back
+    finally:
+        mujoco.set_mjcb_time(None)
+        mujoco.MjData(ball[0])
+    assert timed(*ball)
+
+
+def test_what_mujoco_does_not_have_is_an_error():
+    with pytest.raises(ImportError, match=r"a symbol of MuJoCo .* got 'mjcb_tea'.*Try: a version"):
+        address_of("mjcb_tea")
+
+
+def test_an_error_meanwhile_waits_for_all_threads_and_brings_the_clock_back(ball):
+    stepper = Stepper(ball[0], 64, threads=1)
+    before = clock()
+
+    def fail():
+        raise RuntimeError("meanwhile")
+
+    with pytest.raises(RuntimeError, match="meanwhile"):
+        stepper.rollout(np.zeros((64, 50, 0)), substeps=20, meanwhile=fail)
+    assert stepper._running
+    assert all(future.done() for future in stepper._running)
+    assert clock() == before
+    assert np.ptp(stepper["time"]) == 0.0 < stepper["time"][0]
+
+
 def test_simulations_are_stepped_without_a_clock_and_leave_it_in_its_place(ball):
     seen = []
     stepper = Stepper(ball[0], 2, threads=1)

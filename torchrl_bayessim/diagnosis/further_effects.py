@@ -218,8 +218,8 @@ def beside_variation(
 ) -> bool:
     """Return whether an effect is more than a stopgap for a variation that is not quite known.
 
-    It has no rival; and beside two effects, whose forms leave a little as well, it is some share of
-    the gap.
+    It has no rival; and beside two effects, whose forms leave a little as well, it takes a share of
+    what the variation leaves of the gap.
     """
     alone, before, after = (m.mean_square for m in (start, base, better))
     little = before - after < _REMAINS * (alone - 1.0)

@@ -10,7 +10,10 @@ place of the effects that the search found, and beside them.
 
 from __future__ import annotations
 
-__all__ = ["EVIDENT", "SHARES", "WRONG", "found_beside", "losses", "may_be_beside"]
+__all__ = [
+    "EVIDENT", "SHARES", "WRONG",
+    "all_found", "found_beside", "losses", "may_be_beside",
+]  # fmt: skip
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -75,10 +78,10 @@ def losses(prepared: Prepared, selection: Selection, suspects: Suspects) -> list
     nominal, best, rival = suspects.nominal, suspects.best, suspects.rival
     alone = suspects.alone
     # what the best explanation without chance gains by the same standard
-    found, least = _all_found(nominal, some, alone), sum(alone.costs) - sum(rival.costs)
+    found, least = all_found(nominal, some, alone), sum(alone.costs) - sum(rival.costs)
     able = [unit for unit in some if may_be_beside(unit, selection.best.units)]
     if selection.best.units and able:
-        others = _of_one_drive(_all_found(best, able, rival, selection.best.units))
+        others = _of_one_drive(all_found(best, able, rival, selection.best.units))
         beside = [replace(one, beside=True) for one in others]
         if _most(beside) > _most(found) - least + _NEEDED:
             found, least = beside, 0.0
@@ -110,28 +113,40 @@ def may_be_beside(unit: Unit, others: Sequence[Unit]) -> bool:
 def _sensed(others: Sequence[Unit]) -> bool:
     """Return whether effects are late, or of sensors and more than a constant or a slow drift.
 
-    Samples err with these as if a few were lost; they have to be clearly, or of one sensor alone:
-    what is not quite the true delay, or gain, errs in all that moves.
+    Samples err with these as if a few were lost.
     """
     known = [unit.effect for unit in others]
     sensing = any(e.channel == "sensing" and e.group != SensorBias.group for e in known)
     return sensing or any(effect.group == _LATE for effect in known)
 
 
-def _all_found(
+def all_found(
     data: Mapping[str, LossSegments],
     units: Sequence[Unit],
     alone: Alone,
     others: Sequence[Unit] = (),
 ) -> list[Chance]:
-    likely = [_Likely.of(data, unit, alone) for unit in units]
-    gains = [one.gain if isinstance(one.unit.effect, SensorDropout) else 0.0 for one in likely]
-    most = [max(gains[:i] + gains[i + 1 :], default=0.0) for i in range(len(gains))]
-    found = [
-        one.explaining(alone, others, lone=len(gains) > 1 and rest < _LONE * one.gain)
-        for one, rest in zip(likely, most, strict=True)
-    ]
+    """Return the losses of each unit that explain what they spoil, see `found_beside`.
+
+    Args:
+        data: Short segments of each split.
+        units: What may have been lost.
+        alone: The law without losses.
+        others: Effects that losses are beside.
+    """
+    likely = [_Losses.of(data, unit, alone) for unit in units]
+    found = [one.explaining(alone, others, lone=_lone(one, likely)) for one in likely]
     return [one for one in found if one is not None]
+
+
+def _lone(one: _Losses, every: Sequence[_Losses]) -> bool:
+    """Return whether of several sensors none but one seems to lose samples."""
+    others = [other.gain for other in every if other is not one and _is_sample(other)]
+    return _is_sample(one) and bool(others) and max(others) < _LONE * one.gain
+
+
+def _is_sample(losses: _Losses) -> bool:
+    return isinstance(losses.unit.effect, SensorDropout)
 
 
 def _of_one_drive(found: Sequence[Chance]) -> list[Chance]:
@@ -166,11 +181,18 @@ def found_beside(
     plausible, and to be evident: a force law that is not quite the true one errs everywhere a
     little, as if ever so many of them were.
     """
-    return _Likely.of(data, unit, alone).explaining(alone, others)
+    return _Losses.of(data, unit, alone).explaining(alone, others)
 
 
-class _Likely(NamedTuple):
-    """The likeliest losses of a unit, and by how much they are likelier than none, by split."""
+class _Losses(NamedTuple):
+    """The likeliest losses of a unit.
+
+    Attributes:
+        unit: Whose.
+        law: How they come about.
+        tried: Patterns of losses, by split.
+        gains: By how much they are likelier than none, of the splits that judge.
+    """
 
     unit: Unit
     law: LossLaw
@@ -178,7 +200,7 @@ class _Likely(NamedTuple):
     gains: Sequence[float]
 
     @classmethod
-    def of(cls, data: Mapping[str, LossSegments], unit: Unit, alone: Alone) -> _Likely:
+    def of(cls, data: Mapping[str, LossSegments], unit: Unit, alone: Alone) -> _Losses:
         tried, base = {name: one.tried(unit) for name, one in data.items()}, alone.law
         judged = [tried[name] for name in JUDGED]
         scatters = [s for s in SCATTER.tolist() if s <= base.scatter][-3:]
@@ -188,7 +210,7 @@ class _Likely(NamedTuple):
 
     @property
     def gain(self) -> float:
-        """In all."""
+        """By how much they are likelier than none, of all splits that judge."""
         return sum(self.gains)
 
     def explaining(
@@ -199,7 +221,7 @@ class _Likely(NamedTuple):
         Args:
             alone: The law without losses.
             others: Effects that they are beside.
-            lone: Whether no other sensor seems to have lost samples, too.
+            lone: Whether no other of several sensors seems to have lost samples, too.
         """
         law = self.law
         if self.gain < _NEEDED:
@@ -226,7 +248,7 @@ class _Likely(NamedTuple):
 
 
 def _explain(
-    losses: _Likely, known: Told, *, alone: Alone, others: Sequence[Unit], lone: bool
+    losses: _Losses, known: Told, *, alone: Alone, others: Sequence[Unit], lone: bool
 ) -> bool:
     """Return whether losses explain the segments that have them, and little else is wrong."""
     law, gains, unit = losses.law, losses.gains, losses.unit
@@ -238,6 +260,7 @@ def _explain(
     )
     evident = losses.gain > EVIDENT
     clear = evident and after < _CLEARLY * before
+    # what is not quite the true delay, or gain, errs in all that moves, and not in one sensor alone
     if _sensed(others) and not clear and not (evident and lone):
         return False
     surely = bool(others) and clear

@@ -93,7 +93,8 @@ def _searched(
     for _ in range(_ROUNDS):
         logs = Arrivals(prepared, point, seen.actuators, law).decided(logs)
         again = with_other_logs(prepared, logs, generator=generator)
-        # what wrong decisions leave, two effects that explain little alone would mend, too
+        # what wrong decisions leave, two effects that explain little alone would mend, too: those
+        # are looked for with the commands as sent only, where losses hide all but large ones
         again, selection = search(again, pairs=False)
         if selection.best.mean_square >= least:
             break

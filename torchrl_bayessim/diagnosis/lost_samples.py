@@ -26,7 +26,7 @@ from .beside_losses import CERTAIN, Beside, Sought
 from .loss_law import LossLaw
 from .loss_segments import LossSegments, steps_of
 from .loss_suspects import LIKELIER, Alone
-from .losses import found_beside
+from .losses import all_found
 from .objective import Point, Unit
 from .preparation import Prepared
 from .prepared_anew import with_other_logs
@@ -47,12 +47,13 @@ def beside_lost_samples(sought: Sought) -> Beside | None:
     renewal = _Renewal(prepared, best.unit, best.strength, sought.suspects.alone.law.size)
     known = selection.best if best.beside else selection.nominal
     logs = {name: renewal.of(part, known.fit.point) for name, part in prepared.logs.items()}
-    renewed = with_other_logs(prepared, logs, generator=sought.generator)
-    again, other = sought.search(renewed, pairs=False)
+    again, other = sought.search(with_other_logs(prepared, logs, generator=sought.generator))
     if not set(other.best.names) - set(known.names):
         return None
     data = {name: one.at(other.best.fit.point) for name, one in sought.suspects.nominal.items()}
-    chance = found_beside(data, best.unit, Alone.of(data), other.best.units)
+    sensors = [u for u in sought.suspects.units if isinstance(u.effect, SensorDropout)]
+    lost = all_found(data, sensors, Alone.of(data), other.best.units)
+    chance = next((one for one in lost if one.unit == best.unit), None)
     if chance is None or chance.deviance > best.deviance - CERTAIN:
         return None
     return Beside(prepared, again, other, replace(chance, beside=True))

@@ -37,6 +37,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from ..errors import message
 from .fatal_errors import guarded
 
 for _library in glob.glob(os.path.join(os.path.dirname(mujoco.__file__), "libmujoco*")):
@@ -49,8 +50,16 @@ _numbers = types.CPointer(types.float64)
 
 
 def address_of(symbol: str) -> int:
-    """Return where a function or variable of the library is."""
-    return llvm.address_of_symbol(symbol)
+    """Return where a function or variable of the library is.
+
+    Raises:
+        ImportError: This MuJoCo has none of that name.
+    """
+    address = llvm.address_of_symbol(symbol)
+    if address is None:
+        expected = f"a symbol of MuJoCo {mujoco.__version__}"
+        raise ImportError(message(expected, symbol, hint="a version of MuJoCo that is tested"))
+    return address
 
 
 def _external(name: str, *arguments: types.Type) -> types.ExternalFunction:
