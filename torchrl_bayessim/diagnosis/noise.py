@@ -180,8 +180,7 @@ def _least(linear: Array, known: _Known) -> Array:
 
 def _pushed(point: Point, push: Unit) -> Point:
     """Return a point with a tenth of the largest force at a joint beside what it has there."""
-    force = point.strengths.get(push, 0.0) + 0.1 * push.high
-    return point.beside({push: force})
+    return point.more(push, 0.1 * push.high)
 
 
 def _pieces(logs: Sequence[Log], *, history: int) -> Segments:

@@ -157,6 +157,10 @@ class Point:
         """Return the point with other strengths beside its own, or in the place of those."""
         return Point(self.z, {**self.strengths, **others})
 
+    def more(self, unit: Unit, strength: float) -> Point:
+        """Return the point with so much more of a unit than it has."""
+        return self.beside({unit: self.strengths.get(unit, 0.0) + strength})
+
 
 class Objective:
     """Evaluates points on segments.

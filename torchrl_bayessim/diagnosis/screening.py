@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .objective import Objective, Point, Unit
+from .objective import Objective, Unit
 from .refit import Fit, with_prior
 
 Array = NDArray[np.float64]
@@ -210,14 +210,10 @@ def screen(
     shares = {unit: _levels(unit) if levels is None else levels for unit in units}
     rows = [(unit, level * unit.high) for unit in units for level in shares[unit]]
     rows += [(unit, LEVELS[-1] * unit.low) for unit in units if unit.low < 0]
-    strengths = fit.point.strengths
     changes, wild = [], []
     chunk = max(1, 40_000_000 // max(fit.innovations.size, 1))
     for begin in range(0, len(rows), chunk):
-        points = [
-            Point(fit.point.z, {**strengths, unit: strengths.get(unit, 0.0) + level})
-            for unit, level in rows[begin : begin + chunk]
-        ]
+        points = [fit.point.more(unit, level) for unit, level in rows[begin : begin + chunk]]
         for innovations in objective(points):
             change = (innovations - fit.innovations).astype(np.float32)
             # what is so far off, or diverged, explains nothing: but it would have been seen

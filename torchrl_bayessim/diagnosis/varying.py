@@ -159,8 +159,7 @@ def _by_rows(objective: Objective, point: Point, unit: Unit, step: float) -> Arr
     begin = np.zeros((3, len(segments), 2 * predictor.tangent.size))
     if ahead is not None:
         begin[2][:, predictor.sensing.channels] = ahead[0, :, segments.history]
-    more = point.beside({unit: point.strengths.get(unit, 0.0) + step})
-    points = [point, more, point]
+    points = [point, point.more(unit, step), point]
     before, after, begun = objective.raw(points, segments.freed(begin))
     start = (begun - before) / step
     change = (after - before) / step - start
