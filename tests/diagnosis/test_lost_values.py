@@ -163,16 +163,16 @@ def test_friction_and_samples_that_are_not_renewed_are_both_named():
     assert low <= explained(report) <= high
 
 
-def short_segments(rng, *, lost, spoiled, left=0.0, count=60, steps=8):
+def short_segments(rng, *, lost, spoiled, left=0.0, size=8.0, count=60, steps=8):
     """Segments that noise alone is in, and some with a lost value or spoiled by something else.
 
-    Of the eight variances of noise that a lost value adds some may be left with the right pattern.
+    Of the variances of noise that a lost value adds some may be left with the right pattern.
     """
     tried = np.tile(rng.chisquare(16, count) / 16, (1 + steps, 1))
     tried[1:] += 2.0
     tried[:, :spoiled] += 20.0
     for s in range(spoiled, spoiled + lost):
-        tried[0, s] += 8.0
+        tried[0, s] += size
         tried[1 + rng.integers(steps), s] -= 2.0 - left
     patterns = Tried(tried, np.r_[0, np.ones(steps, dtype=int)], values=steps)
     return SimpleNamespace(
@@ -206,8 +206,20 @@ def test_losses_beside_an_effect_that_explain_what_they_spoil_are_found(
         assert chance.strength == pytest.approx(sum(lost) / 2 / (60 - spoiled) / 8, rel=0.5)
 
 
-def losses_beside(data, other):
-    unit = SimpleNamespace(effect=SensorDropout(), high=0.5)
+@pytest.mark.parametrize(
+    ("size", "effect", "found"),
+    [(1.0, PacketDrop, True), (0.7, PacketDrop, False), (0.7, SensorDropout, True)],
+)
+def test_every_command_that_is_lost_beside_an_effect_is_seen(size, effect, found):
+    """A law that is a little wrong everywhere looks like many losses, hardly one of them sure."""
+    rng = np.random.default_rng(0)
+    splits = "train", "validation", "test"
+    data = {name: short_segments(rng, lost=40, spoiled=3, size=size) for name in splits}
+    assert (losses_beside(data, CoulombFriction, effect) is not None) == found
+
+
+def losses_beside(data, other, effect=SensorDropout):
+    unit = SimpleNamespace(effect=effect(), high=0.5)
     others = () if other is None else (SimpleNamespace(effect=other()),)
     return found_beside(data, unit, Alone.of(data), others)
 

@@ -18,6 +18,7 @@ from ..effects.contacts import ContactFriction
 from ..effects.effect import Effect
 from ..effects.joints import CoulombFriction
 from ..effects.transmission import ServoDeadBand
+from .both_ways import both_ways
 from .explanations import compare
 from .form_fit import softened, with_fitted_forms, with_forms_anew
 from .free_numbers import bendable, fitted_numbers, priced
@@ -98,6 +99,7 @@ def alternatives(
         known += _of_one_law((train, validation), best, kept, offered)
         known += _sliding((train, validation), best, kept, units)
         known += _sticking((train, validation), best, name, units)
+        known += both_ways((train, validation), best, name, units)
         if train.width > Objective.width:
             known += _nearer((train, validation), best, name, known)
         known += _in_their_forms((train, validation), best, known, offered, start=start)

@@ -56,6 +56,7 @@ _FEW = 0.1  # of the deviance that such losses explain: what they may cost in ru
 _BIASED = 0.1  # of the excess of the segments concerned, which parameters leave in all
 _OTHERS = 1 / 6  # of the segments that something else may have spoiled
 _REMAIN = 0.6  # or of those that were spoiled without losses
+_SEEN = 4.0  # deviance that losses beside an effect explain in each segment that has them
 _LONE = 0.2  # of what lost samples of a sensor explain, by those of any other
 EVIDENT, WRONG = 100.0, 0.3  # deviance, to be evident, and segments that losses do not explain
 _LATE = ActionDelay.group
@@ -178,8 +179,8 @@ def found_beside(
     """Return the losses of a unit beside others, nothing if they do not explain what they spoil.
 
     Commands beside an effect have to leave nothing of what they spoil, to be no more than is
-    plausible, and to be evident: a force law that is not quite the true one errs everywhere a
-    little, as if ever so many of them were.
+    plausible, and to be evident, each of them: a force law that is not quite the true one errs
+    everywhere a little, as if ever so many of them were.
     """
     return _Losses.of(data, unit, alone).explaining(alone, others)
 
@@ -274,5 +275,6 @@ def _explain(
         return False  # something else is wrong everywhere, and may look like this
     if after > _EXPLAINED * before:
         return False
-    plausible = clear and law.share <= unit.high
+    one_by_one = losses.gain > _SEEN * concerned.sum()
+    plausible = clear and one_by_one and law.share <= unit.high
     return plausible or not (others and isinstance(unit.effect, PacketDrop))
