@@ -11,6 +11,7 @@ from torchrl_bayessim.diagnosis.further_effects import (
     beside_variation,
     identified,
     stands_apart,
+    surely_elsewhere,
 )
 from torchrl_bayessim.diagnosis.search import Search
 
@@ -246,3 +247,23 @@ def test_what_another_kind_mends_as_well_is_no_effect_beside_a_variation():
     other = plain([A, Unit("delay", "x")], 3990.0, flipped=True)
     assert beside_variation(start, base, better, [better])
     assert not beside_variation(start, base, better, [better, other])
+
+
+@pytest.mark.parametrize(
+    ("without", "left", "where", "needed"),
+    [
+        (500.0, 440.0, "knee", True),  # noise alone is left
+        (500.0, 440.0, "hip", False),  # where the other effect acts
+        (450.0, 440.0, "knee", False),  # chance makes as much
+        (740.0, 540.0, "knee", True),  # half as much again as noise, and less than it takes
+        (640.0, 540.0, "knee", False),  # what the base leaves is mostly something else
+        (2000.0, 800.0, "knee", False),  # off everywhere: anything helps
+    ],
+)
+def test_what_is_elsewhere_is_surely_needed_if_it_takes_most_of_what_is_left(
+    without, left, where, needed
+):
+    """Noise alone would leave 400."""
+    added = Unit("drag", where)
+    base, better = plain([C], without), plain([C, added], left)
+    assert surely_elsewhere(base, better, None) == needed

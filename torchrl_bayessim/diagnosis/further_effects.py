@@ -155,12 +155,14 @@ def _elsewhere(base: Model, better: Model, seen: Screen, robot: Robot, *, beyond
 def surely_elsewhere(base: Model, better: Model, robot: Robot) -> bool:
     """Return whether what a model has beside a base is at another place, and surely needed.
 
-    The model has to leave noise alone: one that is off everywhere needs whatever mends some of it.
+    The model has to leave noise alone, or little more and less than it takes: one that is off
+    everywhere needs whatever mends some of it.
     """
-    lost = total_gain(base, better)
-    places = _places_of(base, robot)
+    lost, places = total_gain(base, better), _places_of(base, robot)
     apart = any(not _places(unit, robot) <= places for unit in better.beyond(base))
-    return apart and lost > _PLAIN and better.mean_square < _VISIBLE
+    before, after = base.mean_square, better.mean_square
+    most = after < _WRONG and before - after > _REST * (before - 1.0)
+    return apart and lost > _PLAIN and (most or after < _VISIBLE)
 
 
 def _told(base: Model, seen: Screen, robot: Robot) -> dict[Unit, float]:
