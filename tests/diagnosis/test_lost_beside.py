@@ -10,7 +10,8 @@ from test_diagnose import logs, system
 
 from torchrl_bayessim.diagnosis.chance import _of_one_place
 from torchrl_bayessim.diagnosis.diagnose import diagnose
-from torchrl_bayessim.diagnosis.with_chance import _beside_losses
+from torchrl_bayessim.diagnosis.with_chance import _beside_losses, with_chance
+from torchrl_bayessim.effects.action import PacketDrop
 
 SOME = (
     "parallel_spring", "packet_drop", "sensor_dropout", "action_delay", "coulomb_friction",
@@ -84,3 +85,49 @@ def test_of_samples_that_are_decided_on_one_by_one_a_few_have_to_be_lost(monkeyp
     monkeypatch.setattr(where + "beside_lost_commands", lambda _: None)
     monkeypatch.setattr(where + "beside_lost_samples", lambda _: None)
     assert _beside_losses("before", sought) == ("before", "selection", [mine, other], None)
+
+
+@dataclass(frozen=True)
+class PlainPrepared:
+    """What a search starts from."""
+
+    alarms: tuple[str, ...] = ()
+    sets: dict = field(default_factory=lambda: {"train": None})
+
+
+@pytest.mark.parametrize(("calm", "asked"), [(True, True), (False, False), (None, True)])
+def test_long_segments_say_what_is_lost_beside_effects_where_short_ones_hold_noise_alone(
+    monkeypatch, calm, asked
+):
+    """Where those hold more, losses are seen there one by one, or there are none."""
+    drop = SimpleNamespace(effect=PacketDrop(), targets=[0])
+    selection = SimpleNamespace(best=SimpleNamespace(units=()), offered=())
+    suspects = calm is not None and SimpleNamespace(rival=SimpleNamespace(calm=calm))
+    beside = []
+
+    def chances(sets, selection, units, **given):
+        beside.extend(units if given else [])
+        return []
+
+    where = "torchrl_bayessim.diagnosis.with_chance."
+    monkeypatch.setattr(where + "Suspects.of", lambda *_: suspects or None)
+    monkeypatch.setattr(where + "losses", lambda *_: [])
+    monkeypatch.setattr(where + "_beside_losses", lambda p, s: (p, selection, [], None))
+    monkeypatch.setattr(where + "beside_jitter", lambda *_, **__: None)
+    monkeypatch.setattr(where + "_may_be_jitter", lambda *_: False)
+    monkeypatch.setattr(where + "of_chance", list)
+    monkeypatch.setattr(where + "chances", chances)
+    monkeypatch.setattr(where + "_beside_variation", lambda search, p, s, random: (p, s))
+    monkeypatch.setattr(where + "detectable", lambda *_: [])
+    monkeypatch.setattr(where + "unseen", lambda *_: [])
+    with_chance(
+        PlainPrepared(),
+        selection,
+        logs=[],
+        units=[drop],
+        holds=[],
+        alarms=(),
+        search=pytest.fail,
+        generator=np.random.default_rng(0),
+    )
+    assert (beside == [drop]) is asked

@@ -74,7 +74,8 @@ def with_chance(
             prepared, selection = shaken.prepared, shaken.selection
     found = found or chances(prepared.sets, selection, random)
     elsewhere = sent is None and shaken is None and not holds
-    if elsewhere and not found:
+    # where short segments hold more than noise, what is lost is seen there, one by one
+    if elsewhere and not found and (suspects is None or suspects.rival.calm):
         lost = [unit for unit in random if _may_be_lost_beside(unit, selection.best)]
         found = chances(prepared.sets, selection, lost, beside=True)
     if elsewhere and not any(chance.beside for chance in found):
