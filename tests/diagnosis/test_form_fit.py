@@ -67,6 +67,22 @@ def test_a_spring_is_found_with_how_it_hardens_and_nothing_beside_it(hardening, 
     assert report.gap.with_effects < 1.1
 
 
+@pytest.mark.parametrize("power", [0.7, 1.0])
+def test_a_damping_by_a_power_of_speed_is_found_and_nothing_beside_it(power):
+    """In proportion to speed it would leave something like dry friction."""
+    runs = logs(8, push=lambda q, v: -0.25 * np.sign(v) * np.abs(v) ** power)
+    report = diagnose(robot(), None, runs, effects=(*SOME, "stribeck_friction", "quadratic_drag"))
+    assert [effect.name for effect in report.effects] == ["viscous_friction"]
+    (found,) = report.effects
+    if power == 1.0:
+        assert "power" not in found.form
+    else:
+        assert found.form["power"] == pytest.approx(power, abs=0.05)
+        # the model's own damping, which is in proportion to speed, is a parameter
+        assert found.strength == pytest.approx(0.25, rel=0.1)
+    assert report.gap.with_effects < 1.3
+
+
 def test_magnets_behind_a_gear_are_found_with_their_number_per_turn_of_the_hinge():
     runs = logs(push=lambda q, v: 0.15 * np.sin(6.5 * q + 1.0))
     report = diagnose(robot(), None, runs, effects=(*SOME, "gravity_tilt", "action_gain"))

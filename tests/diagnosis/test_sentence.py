@@ -86,3 +86,19 @@ def test_a_law_that_bends_is_said_to(form, said):
         "parallel_spring", {"hinge": 2.0}, where="hinge", strength=2.0, form=form, unit="N m/rad"
     )
     assert _described(one) == f"parallel spring at hinge {said}"
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "said"),
+    [
+        ("viscous_friction", {"power": 0.8}, ", by the power 0.8 of speed"),
+        ("viscous_friction", {"rise": -0.1}, ", and -0.1 of it per unit of speed"),
+        ("viscous_friction", {"rise": 0.0}, ""),
+        ("quadratic_drag", {"power": 2.0}, ""),  # as its name says
+        ("quadratic_drag", {"power": 2.2}, ", by the power 2.2 of speed"),
+        ("drag_of_my_own", {"power": 2.0}, ", by the power 2 of speed"),
+    ],
+)
+def test_a_law_is_said_to_bend_where_its_name_does_not_say_so(name, form, said):
+    found = finding(name, {"a": 0.3}, where="a", strength=0.3, form=form, unit="N m")
+    assert _described(found).endswith(f"(0.3 ± 0.01 N m{said})")

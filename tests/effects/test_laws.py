@@ -16,7 +16,9 @@ from torchrl_bayessim.effects.catalogue import CATALOGUE, effect
 from torchrl_bayessim.effects.effect import ActionEffect, Reach, SensorEffect
 from torchrl_bayessim.effects.fields import ModelFields
 from torchrl_bayessim.effects.forcing import Forcing
+from torchrl_bayessim.effects.friction import PowerLawFriction
 from torchrl_bayessim.effects.history import advanced, delayed, empty_line, read_line
+from torchrl_bayessim.effects.joints import ViscousFriction
 from torchrl_bayessim.effects.laws import two_lags
 from torchrl_bayessim.effects.overlay import Overlay
 from torchrl_bayessim.effects.robot import Robot, robot_of
@@ -281,6 +283,18 @@ def test_friction_laws():
     at = pytest.approx
     assert forces("stribeck_friction", 2.0, qvel=0.2)["dof_frictionloss"] == at([2 / math.e] * 4)
     assert forces("quadratic_drag", 2.0, qvel=-3.0)["dof_damping"] == at([6.0] * 4)
+    assert forces("quadratic_drag", 2.0, qvel=-3.0, power=2.5)["dof_damping"] == at(
+        [2 * 3**1.5] * 4
+    )
+    thins = forces("viscous_friction", 2.0, qvel=-3.0, power=0.8)["dof_damping"]
+    assert thins == at([2 * 3**-0.2] * 4)  # a force of 2 · 3^0.8
+    for speed in (0.0, 1e-4, -1e-3):
+        creeps = forces("viscous_friction", 2.0, qvel=speed, power=0.8)["dof_damping"]
+        assert creeps == at([2 * 1e-3**-0.2] * 4)
+    assert isinstance(effect("viscous_friction", rise=0.1), ViscousFriction)
+    assert isinstance(effect("viscous_friction", power=1.2), PowerLawFriction)
+    with pytest.raises(ValueError, match="power, of speed"):
+        effect("viscous_friction", power=0.0)
     for strength in (2.0, -2.0):  # the sum is -s, or nothing, by the direction of motion
         one = forces("directional_friction", strength)
         along, helps = np.array(one["dof_frictionloss"]), np.array(one["qfrc_applied"])
@@ -303,6 +317,15 @@ def test_friction_laws():
         assert begun == at([s * (1 - math.exp(-abs(speed) / 0.2)) for s in (1.5, 2.5, 2.0, 0.0)])
     with pytest.raises(ValueError, match="onset, a speed over which friction begins"):
         effect("load_dependent_friction", onset=-0.1)
+
+
+@pytest.mark.parametrize(("rise", "velocity"), [(-0.1, 2.0), (0.05, 3.0), (-0.02, 1.0)])
+def test_a_power_of_speed_bends_as_a_damping_does_that_changes_with_it(rise, velocity):
+    """Both forces have the same slope there, relative to themselves."""
+    power = PowerLawFriction.like(rise, velocity).power
+    slope = (1 + 2 * rise * velocity) / (velocity * (1 + rise * velocity))
+    assert power / velocity == pytest.approx(slope)
+    assert PowerLawFriction.like(10.0, 10.0).power == 1.5  # no more than a diagnosis fits
 
 
 def test_disturbances():

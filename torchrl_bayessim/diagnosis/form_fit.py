@@ -25,6 +25,7 @@ from .corners import soft_start, with_corners
 from .free_numbers import Shift, shifts_of, value_of
 from .model import LIKELY, WHITE, Model, judged, judged_fits, price
 from .objective import Objective, Point, Unit
+from .powers import by_power
 from .refit import Fit, outrun, refit, with_prior
 
 Array = NDArray[np.float64]
@@ -65,7 +66,19 @@ def with_fitted_forms(
         return placed
     needed = price(placed) * (_WHITER if placed.mean_square < WHITE else 1.0)
     fitted = _fitted(sets, placed, needed=LIKELY + count * needed, race=race)
-    return fitted if fitted is placed else with_corners(sets, fitted, offered)
+    if fitted is placed:
+        return fitted
+    return _by_power(sets, with_corners(sets, fitted, offered), race=race)
+
+
+def _by_power(sets: tuple[Objective, Objective], model: Model, *, race: float) -> Model:
+    """Return the model with dampings that bend by a power of speed where that explains more."""
+    start = by_power(sets[0], model) if model.mean_square > WHITE else None
+    if start is None:
+        return model
+    (other,) = judged_fits(*sets, [start])
+    other = _fitted(sets, other, race=race)
+    return other if other.fit.cost < model.fit.cost else model
 
 
 def softened(

@@ -89,9 +89,9 @@ def fitted_numbers(model: Model, offered: Collection[Unit]) -> int:
 
 def _bent(unit: Unit, offered: Collection[Unit]) -> int:
     """Return how many numbers of a law are none that it was offered with, but for placed ones."""
-    alike = [u.effect.form for u in offered if type(u.effect) is type(unit.effect)]
-    if not alike:
+    if not any(u.name == unit.name for u in offered):
         return 0
+    alike = [u.effect.form for u in offered if type(u.effect) is type(unit.effect)]
     return sum(
         number in unit.effect.nuisances or value not in [form[number] for form in alike]
         for number, value in unit.effect.form.items()

@@ -7,6 +7,7 @@ __all__ = ["sentence"]
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
+from ..effects.catalogue import CATALOGUE
 from ..logs.system import System
 from .cells import plain
 from .preparation import Prepared
@@ -19,6 +20,7 @@ _MUCH = 0.2  # of the error, to say that it sits there
 _FORMS = {"frequency": ", {:.3g} Hz", "number": ", {:.3g} per turn or 2π m"}
 _BENT = {
     "hardening": ", hardening by {:.2g} x²", "rise": ", and {:+.2g} of it per unit of speed",
+    "power": ", by the power {:.2g} of speed",
     "softness": ", softness {:.2g}", "bend": ", bent by {:+.2g}",
     "settling": ", settling at {:.2g} per second",
     "second": ", {:.0%} of it in a second filter",
@@ -182,7 +184,7 @@ def _percent(share: float) -> str:
 def _described(effect: Finding) -> str:
     half = (effect.ci95[1] - effect.ci95[0]) / 2
     name = plain(effect.name)
-    law = _law(effect.form)
+    law = _law(effect.name, effect.form)
     if len(effect.strengths) > 1:
         least, most = (pick(effect.strengths.values()) for pick in (min, max))
         if most - least <= 1e-3 * abs(most):
@@ -197,10 +199,12 @@ def _described(effect: Finding) -> str:
     return f"{name} {_place(effect.where)} ({effect.strength:.3g} ± {half:.2g} {effect.unit}{law})"
 
 
-def _law(form: Mapping[str, Any]) -> str:
+def _law(name: str, form: Mapping[str, Any]) -> str:
     """Return what tells a law from others of its name: how fast it oscillates, how it bends."""
-    shown = [text.format(form[name]) for name, text in _FORMS.items() if name in form]
-    return "".join(shown + [t.format(form[name]) for name, t in _BENT.items() if form.get(name)])
+    usual = CATALOGUE[name]().form if name in CATALOGUE else {}
+    bent = {n: x for n, x in form.items() if x and (n not in usual or x != usual[n])}
+    shown = [text.format(form[number]) for number, text in _FORMS.items() if number in form]
+    return "".join(shown + [text.format(bent[n]) for n, text in _BENT.items() if n in bent])
 
 
 def _place(where: str) -> str:
@@ -229,7 +233,7 @@ def _least(candidates: Sequence[Candidate]) -> str:
     everywhere = len({c.where for c in single}) > 1 and len(shown) == len(single)
     place = "anywhere" if everywhere else _place(worst.where)
     least = f"{worst.minimal_detectable_strength:.2g} {worst.unit}"
-    return f"{plain(worst.name)}{_law(worst.form)} above {least} {place}"
+    return f"{plain(worst.name)}{_law(worst.name, worst.form)} above {least} {place}"
 
 
 def _untested(candidates: Sequence[Candidate]) -> str:

@@ -13,6 +13,7 @@ from __future__ import annotations
 __all__ = [
     "DirectionalFriction",
     "LoadDependentFriction",
+    "PowerLawFriction",
     "PreslidingFriction",
     "QuadraticDrag",
     "StribeckFriction",
@@ -32,6 +33,8 @@ from .robot import Robot
 _PRESLIDING = 0.005  # rad or m
 _ONSET = 0.1  # rad/s or m/s
 _SLOWEST = 1e-6  # of that
+_CREEP = 1e-3  # rad/s or m/s
+_THINNEST, _THICKEST = 0.5, 1.5  # powers
 _SHARP = 0.005  # rad/s or m/s: an onset that no time step resolves
 
 
@@ -114,7 +117,25 @@ class StribeckFriction(ForceEffect):
         return {"frictionloss": strength * torch.exp(-((now.velocity / self.speed) ** 2))}, memory
 
 
-class QuadraticDrag(ForceEffect):
+class _PowerLaw(ForceEffect):
+    """A force ``−s v |v|ᵖ⁻¹``, as a damping.
+
+    Below a thousandth of a unit of speed the damping is what it is there.
+    """
+
+    def __init__(self, power: float) -> None:
+        self.power = power
+
+    def forces(
+        self, strength: Tensor, memory: Memory, now: Now
+    ) -> tuple[Mapping[str, Tensor], Memory]:
+        """Return the damping at this speed."""
+        speed = now.velocity.abs()
+        speed = speed.clamp(min=_CREEP) if self.power < 1 else speed
+        return {"damping": strength * speed ** (self.power - 1)}, memory
+
+
+class QuadraticDrag(_PowerLaw):
     """Drag ``−s v |v|ᵖ⁻¹``, ``p = 2``, as a damping; N m s²/rad², up to 30 % of ``F_max/v_max²``.
 
     Args:
@@ -124,7 +145,7 @@ class QuadraticDrag(ForceEffect):
     name, unit, group = "quadratic_drag", "N m s²/rad²", "friction"
 
     def __init__(self, power: float = 2.0) -> None:
-        self.power = power
+        super().__init__(power)
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
         """Return the power, nearer to 2 than to that of other friction."""
@@ -135,11 +156,45 @@ class QuadraticDrag(ForceEffect):
         """Return 0 and 0.3 ``F_max / v_max²``."""
         return within(robot.force_scale / robot.velocity_scale**2, 0.0, 0.3)
 
-    def forces(
-        self, strength: Tensor, memory: Memory, now: Now
-    ) -> tuple[Mapping[str, Tensor], Memory]:
-        """Return the damping at this speed."""
-        return {"damping": strength * now.velocity.abs() ** (self.power - 1)}, memory
+
+class PowerLawFriction(_PowerLaw):
+    """Damping ``−s v |v|ᵖ⁻¹`` by a lubricant that thins with speed, or thickens; N m s/rad.
+
+    The power law of Ostwald (1925) and de Waele for such fluids, whose viscosity goes with the
+    power ``p − 1`` of the shear; ``s`` is the damping at a speed of 1. Up to 1.2 ``F_max / v_max``.
+
+    Args:
+        power: ``p``, 1 for a fluid that does neither; a diagnosis fits it.
+
+    Raises:
+        ValueError: ``power`` is not above 0.
+    """
+
+    name, unit, group = "viscous_friction", "N m s/rad", "friction"
+
+    def __init__(self, power: float) -> None:
+        check_number("power, of speed", power, above=0.0)
+        super().__init__(power)
+
+    @classmethod
+    def like(cls, rise: float, velocity: float) -> PowerLawFriction:
+        """Return the law whose force bends as ``v (1 + r v)`` does at a velocity.
+
+        Example:
+            >>> PowerLawFriction.like(-0.1, velocity=2.0)
+            PowerLawFriction(power=0.75)
+        """
+        part = rise * velocity
+        return cls(power=min(max(1.0 + part / (1.0 + part), _THINNEST), _THICKEST))
+
+    def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
+        """Return the power, nearer to 1 than to that of other friction."""
+        del reach
+        return {"power": (0.02, _THINNEST, _THICKEST)}
+
+    def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
+        """Return 0 and 1.2 ``F_max / v_max``."""
+        return within(robot.force_scale / robot.velocity_scale, 0.0, 1.2)
 
 
 class LoadDependentFriction(ForceEffect):

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from .effect import Effect, Fields, ModelEffect, Reach
-from .friction import PreslidingFriction
+from .friction import PowerLawFriction, PreslidingFriction
 from .laws import within
 from .robot import Robot
 
@@ -70,6 +70,8 @@ class CoulombFriction(_Joint):
 class ViscousFriction(_Joint):
     """Damping ``−s v (1 + r |v|)``; N m s/rad, up to 30 % of ``F_max`` at a quarter of ``v_max``.
 
+    By the same name, with an option ``power``: `friction.PowerLawFriction`.
+
     Args:
         rise: ``r``, s/rad or s/m; negative for grease that thins. A diagnosis fits it.
     """
@@ -78,6 +80,11 @@ class ViscousFriction(_Joint):
 
     def __init__(self, rise: float = 0.0) -> None:
         self.rise = rise
+
+    @classmethod
+    def law(cls, **options: Any) -> Effect:
+        """Return the damping, by a power of speed if that is among the options."""
+        return PowerLawFriction(**options) if "power" in options else cls(**options)
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
         """Return the rise: from half to twice the damping at the largest speed."""

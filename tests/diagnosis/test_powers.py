@@ -1,0 +1,54 @@
+"""Dampings that bend by a power of speed, in the place of those that bend in proportion to it."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from plain_models import plain
+from test_diagnose import system
+
+from torchrl_bayessim.diagnosis.free_numbers import fitted_numbers
+from torchrl_bayessim.diagnosis.objective import units_of
+from torchrl_bayessim.diagnosis.powers import by_power
+from torchrl_bayessim.effects.friction import PowerLawFriction, QuadraticDrag
+from torchrl_bayessim.effects.joints import ViscousFriction
+
+ROBOT = system().robot
+FASTEST = 4.0  # rad/s
+SEGMENTS = SimpleNamespace(
+    qpos=np.zeros((2, 3, 1)), qvel=np.full((2, 3, 1), FASTEST), time=np.ones((2, 3))
+)
+TRAIN = SimpleNamespace(
+    predictor=SimpleNamespace(system=SimpleNamespace(robot=ROBOT)), segments=SEGMENTS
+)
+
+
+def at_hinge(effect):
+    return next(unit for unit in units_of([effect], ROBOT) if unit.where == "hinge")
+
+
+DRAG, STRAIGHT, BENT = (
+    at_hinge(effect) for effect in (QuadraticDrag(), ViscousFriction(), ViscousFriction(-0.1))
+)
+
+
+def test_a_damping_that_was_bent_becomes_a_power_of_the_same_force():
+    point = by_power(TRAIN, plain({DRAG: 0.1, BENT: 0.2}, 1000.0))
+    law = next(unit for unit in point.strengths if isinstance(unit.effect, PowerLawFriction))
+    assert point.strengths.keys() == {DRAG, law}
+    speed = 0.3 * FASTEST
+    bent = 0.2 * speed * (1 - 0.1 * speed)
+    assert point.strengths[law] * speed**law.effect.power == pytest.approx(bent)
+    assert law.where == BENT.where
+
+
+@pytest.mark.parametrize("units", [{DRAG: 0.1}, {STRAIGHT: 0.1}, {}])
+def test_what_was_not_bent_stays_as_it_is(units):
+    assert by_power(TRAIN, plain(units, 1000.0)) is None
+
+
+def test_a_power_that_was_fitted_counts_as_a_number():
+    """A law of the same name was offered, with no such number."""
+    law = at_hinge(PowerLawFriction(0.8))
+    assert fitted_numbers(plain({law: 0.1}, 1000.0), [STRAIGHT]) == 2
+    assert fitted_numbers(plain({law: 0.1}, 1000.0), [DRAG]) == 1
