@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from torchrl_bayessim.diagnosis import confusion
-from torchrl_bayessim.diagnosis.alternatives import exchanged, leaves_less_to_do
 from torchrl_bayessim.diagnosis.confusion import confusion_set, rivals, settled
+from torchrl_bayessim.diagnosis.exchange import exchanged, leaves_less_to_do
 from torchrl_bayessim.diagnosis.model import Model
 from torchrl_bayessim.diagnosis.objective import Point, Unit
 from torchrl_bayessim.diagnosis.refit import Fit

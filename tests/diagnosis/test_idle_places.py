@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from plain_models import A, B, C, Unit, plain
 
-from torchrl_bayessim.diagnosis.alternatives import exchanged
 from torchrl_bayessim.diagnosis.credit import worthwhile
 from torchrl_bayessim.diagnosis.elimination import _idle_place, _one_event, _without_doubt
+from torchrl_bayessim.diagnosis.exchange import exchanged
 from torchrl_bayessim.diagnosis.model import Model
 from torchrl_bayessim.diagnosis.selection import Selection
 

@@ -6,10 +6,9 @@ would do as well beside the effects that were found since, is fitted here.
 
 from __future__ import annotations
 
-__all__ = ["alternatives", "exchanged", "kind", "leaves_less_to_do", "stands_in"]
+__all__ = ["alternatives", "kind", "stands_in"]
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from functools import partial
 
 import numpy as np
 
@@ -21,18 +20,9 @@ from ..effects.transmission import ServoDeadBand
 from .both_ways import both_ways
 from .explanations import compare
 from .form_fit import softened, with_fitted_forms, with_forms_anew
-from .free_numbers import bendable, fitted_numbers, priced
+from .free_numbers import bendable, fitted_numbers
 from .imitators import imitators
-from .model import (
-    LIKELY,
-    Model,
-    as_good,
-    best_by_effect,
-    gain,
-    judged_fits,
-    needed,
-    numbers,
-)
+from .model import Model, as_good, best_by_effect, judged_fits
 from .objective import Objective, Point, Unit
 from .refit import WIDE, refit
 from .screening import Screen
@@ -42,8 +32,6 @@ _RIVALS = 6  # models with another effect in the place of one
 _LAWS = 2  # of those that bend
 _NEARLY, _FORMS = 0.05, 3  # of what is explained; of those that explain all but that
 _MORE, _LITTLE = 5.0, 0.05  # mean squared innovation; share of friction's range, to start from
-_SMALLER = 0.75  # times: all strengths of an equal that is plainer
-_LESS = 0.5  # times: of what an effect did that made up for another
 _ALONG = (0.25, 0.5)  # of the range of friction in contacts, to start from
 
 
@@ -273,53 +261,3 @@ def _with_each(base: Model, additions: Iterable[Mapping[Unit, float]]) -> list[P
 def _raced(sets: tuple[Objective, Objective], starts: Sequence[Point], best: Model) -> list[Model]:
     """Fit what can come near the best model's cost."""
     return judged_fits(*sets, starts, race=best.fit.cost) if starts else []
-
-
-def exchanged(
-    best: Model, others: Mapping[str, Sequence[Model]], offered: Collection[Unit] = ()
-) -> Model:
-    """Return the best of a model and its alternatives, itself unless chance is unlikely.
-
-    Or unless one that is as good leaves less for the others to do (`leaves_less_to_do`).
-
-    Args:
-        best: The model.
-        others: Its alternatives, by the effect in whose place they have another.
-        offered: The effects as they were offered: numbers that were fitted have their price.
-    """
-    cost = partial(priced, offered=offered, dispersion=best.dispersion())
-    every = [model for models in others.values() for model in models]
-    candidates = [
-        m for m in every if len(m.units) <= len(best.units) or gain(best, m) > needed(best, m)
-    ]
-    first = min([best, *candidates], key=cost)
-    better_by = cost(best) - cost(first)
-    if len(first.units) > len(best.units) and as_good(first, best):
-        return best  # something is wrong with both, and more strengths mend more of it
-    if better_by > LIKELY:
-        return first
-    plainer = [m for m in every if leaves_less_to_do(best, m)]
-    return min(plainer, key=cost, default=best)
-
-
-def leaves_less_to_do(best: Model, other: Model) -> bool:
-    """Return whether the others have little to do beside another effect of a kind that is as good.
-
-    Friction in one direction and a push that is half of it against the other are friction in both.
-    All strengths together have to be smaller, as shares of their ranges: the other way round a push
-    beside friction in both directions would be less push beside friction in one.
-    """
-    mine, others = _shares(best), _shares(other)
-    shared = mine.keys() & others.keys()
-    instead = {u.effect.group for u in others.keys() - shared}
-    alike = instead == {u.effect.group for u in mine.keys() - shared} and len(instead) == 1
-    if not alike or numbers(other) > numbers(best):
-        return False
-    made_up_for = any(others[unit] < _LESS * mine[unit] for unit in shared)
-    smaller = sum(others.values()) < _SMALLER * sum(mine.values())
-    return made_up_for and smaller and as_good(best, other)
-
-
-def _shares(model: Model) -> dict[Unit, float]:
-    """Return the size of each strength as a share of its range."""
-    return {unit: abs(s / unit.high) for unit, s in model.fit.point.strengths.items()}

@@ -11,8 +11,9 @@ from dataclasses import replace
 from ..effects.effect import Effect
 from ..effects.joints import Armature
 from ..effects.transmission import ServoDeadBand
-from .alternatives import kind, leaves_less_to_do
+from .alternatives import kind
 from .elimination import parts, without_idle
+from .exchange import leaves_less_to_do
 from .free_numbers import priced
 from .model import Model, as_good, judged_fits
 from .objective import Objective, Point

@@ -18,8 +18,9 @@ from functools import partial
 
 import numpy as np
 
-from .alternatives import alternatives, exchanged, stands_in
+from .alternatives import alternatives, stands_in
 from .elimination import eliminated
+from .exchange import exchanged
 from .model import LIKELY, Model, judged, judged_fits
 from .objective import Objective, Point, Unit
 from .refit import Fit

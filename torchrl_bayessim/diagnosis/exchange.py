@@ -1,0 +1,65 @@
+"""Whether another effect is taken in the place of one of the best model's."""
+
+from __future__ import annotations
+
+__all__ = ["exchanged", "leaves_less_to_do"]
+
+from collections.abc import Collection, Mapping, Sequence
+from functools import partial
+
+from .free_numbers import priced
+from .model import LIKELY, Model, as_good, gain, needed, numbers
+from .objective import Unit
+
+_SMALLER = 0.75  # times: all strengths of an equal that is plainer
+_LESS = 0.5  # times: of what an effect did that made up for another
+
+
+def exchanged(
+    best: Model, others: Mapping[str, Sequence[Model]], offered: Collection[Unit] = ()
+) -> Model:
+    """Return the best of a model and its alternatives, itself unless chance is unlikely.
+
+    Or unless one that is as good leaves less for the others to do (`leaves_less_to_do`).
+
+    Args:
+        best: The model.
+        others: Its alternatives, by the effect in whose place they have another.
+        offered: The effects as they were offered: numbers that were fitted have their price.
+    """
+    cost = partial(priced, offered=offered, dispersion=best.dispersion())
+    every = [model for models in others.values() for model in models]
+    candidates = [
+        m for m in every if len(m.units) <= len(best.units) or gain(best, m) > needed(best, m)
+    ]
+    first = min([best, *candidates], key=cost)
+    better_by = cost(best) - cost(first)
+    if len(first.units) > len(best.units) and as_good(first, best):
+        return best  # something is wrong with both, and more strengths mend more of it
+    if better_by > LIKELY:
+        return first
+    plainer = [m for m in every if leaves_less_to_do(best, m)]
+    return min(plainer, key=cost, default=best)
+
+
+def leaves_less_to_do(best: Model, other: Model) -> bool:
+    """Return whether the others have little to do beside another effect of a kind that is as good.
+
+    Friction in one direction and a push that is half of it against the other are friction in both.
+    All strengths together have to be smaller, as shares of their ranges: the other way round a push
+    beside friction in both directions would be less push beside friction in one.
+    """
+    mine, others = _shares(best), _shares(other)
+    shared = mine.keys() & others.keys()
+    instead = {u.effect.group for u in others.keys() - shared}
+    alike = instead == {u.effect.group for u in mine.keys() - shared} and len(instead) == 1
+    if not alike or numbers(other) > numbers(best):
+        return False
+    made_up_for = any(others[unit] < _LESS * mine[unit] for unit in shared)
+    smaller = sum(others.values()) < _SMALLER * sum(mine.values())
+    return made_up_for and smaller and as_good(best, other)
+
+
+def _shares(model: Model) -> dict[Unit, float]:
+    """Return the size of each strength as a share of its range."""
+    return {unit: abs(s / unit.high) for unit, s in model.fit.point.strengths.items()}
