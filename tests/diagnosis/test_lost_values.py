@@ -232,6 +232,17 @@ def test_what_losses_leave_speaks_against_them_where_another_law_of_a_sensor_wou
     assert losses_beside(data, SensorGain) is None
 
 
+@pytest.mark.parametrize(("lost", "found"), [((12, 12), True), ((40, 2), False)])
+def test_losses_beside_an_effect_that_leave_some_show_in_runs_that_judge_as_in_those_of_the_fit(
+    lost, found
+):
+    """A foot that touches the ground at another time spoils samples as if a few were lost."""
+    rng = np.random.default_rng(0)
+    counts = dict(zip(("train", "validation", "test"), (*lost, 6), strict=True))
+    data = {n: short_segments(rng, lost=k, spoiled=3, left=1.5) for n, k in counts.items()}
+    assert (losses_beside(data, CoulombFriction) is not None) == found
+
+
 class Sensors:
     """Segments with a lost value each, of which every unit explains so many and no others."""
 

@@ -52,6 +52,9 @@ _NEEDED, _LIKELY = 40.0, 6.0
 _EXPLAINED = 0.5  # of the excess of the segments concerned, by what is left of them
 _CLEARLY = 0.1  # of it may be left of what is found clearly
 _ELSEWHERE = 0.5  # of what lost commands of a drive explain, by those of another
+_JUDGED = (
+    0.15  # of the deviance that losses explain in runs of the fit, by those in runs that judge
+)
 _FEW = 0.1  # of the deviance that such losses explain: what they may cost in runs without any
 _BIASED = 0.1  # of the excess of the segments concerned, which parameters leave in all
 _OTHERS = 1 / 6  # of the segments that something else may have spoiled
@@ -265,8 +268,10 @@ def _explain(
     if _sensed(others) and not clear and not (evident and lone):
         return False
     surely = bool(others) and clear
-    # where losses come in bursts, the runs that judge may have had hardly any
-    if gains[1] < -max(_LIKELY, _FEW * gains[0] if surely else 0.0):
+    # where losses come in bursts, the runs that judge may have had hardly any; and a few segments
+    # that something else spoils look a little like losses, in the runs where they are
+    least = -max(_LIKELY, _FEW * gains[0] if surely else 0.0)
+    if gains[1] < (_JUDGED * gains[0] if others and not clear else least):
         return False
     # parameters that were fitted without losses are a little off everywhere
     noise = max(NOISE, min(LEFT, 1.0 + _BIASED * before))

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..effects.action import ActionQuantization
+from .bent_laws import fitted_best
 from .choice import chosen, fewest
 from .elimination import eliminated, without_stopgaps
 from .explanations import Round, bent, compare, explanations
@@ -214,8 +215,12 @@ class Search:
         if self.varied:  # several at once make up for a variation that is not quite known
             there = {unit.name for unit in now.base.units}
             models = [model for model in models if len(model.names - there) < 2]
-        self.tried += models
         better = best_of(models)
+        formed = fitted_best(self.sets, better, models, self.offered)
+        if formed:
+            models += formed
+            better = best_of(models)
+        self.tried += models
         if better is None:
             return None
         fitted = with_fitted_forms(*self.sets, exactly(*self.sets, better), self.offered)
