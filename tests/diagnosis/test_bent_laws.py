@@ -1,4 +1,4 @@
-"""Laws that fit better than the best explanation and predict worse."""
+"""Laws that fit better than the best explanation, and lost because they predict worse."""
 
 from dataclasses import replace
 

@@ -1,5 +1,6 @@
 """Friction in both directions and a push, in the place of friction in one."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -9,19 +10,21 @@ from test_diagnose import system
 from torchrl_bayessim.diagnosis import both_ways
 from torchrl_bayessim.diagnosis.objective import units_of
 from torchrl_bayessim.effects.action import ActionBias
+from torchrl_bayessim.effects.disturbance import ConstantForce
 from torchrl_bayessim.effects.friction import DirectionalFriction, PreslidingFriction
 from torchrl_bayessim.effects.joints import CoulombFriction, ViscousFriction
 
 ROBOT = system().robot
 SETS = (SimpleNamespace(predictor=SimpleNamespace(system=SimpleNamespace(robot=ROBOT))), None)
-ONE_WAY, DRY, SOFT, PUSH, VISCOUS = (
+ONE_WAY, DRY, SOFT, PUSH, FORCE, VISCOUS = (
     next(unit for unit in units_of([effect], ROBOT) if unit.where != "all")
     for effect in (
         DirectionalFriction(), CoulombFriction(), PreslidingFriction(), ActionBias(),
-        ViscousFriction(),
+        ConstantForce(), ViscousFriction(),
     )
 )  # fmt: skip
-EVERY = [ONE_WAY, DRY, SOFT, PUSH, VISCOUS]
+EVERY = [ONE_WAY, DRY, SOFT, PUSH, FORCE, VISCOUS]
+BENT = replace(SOFT, effect=PreslidingFriction(0.007))
 
 
 @pytest.fixture
@@ -42,10 +45,9 @@ def test_half_of_friction_in_one_direction_is_tried_in_both_in_all_forms_beside_
     best = plain({ONE_WAY: -0.4, VISCOUS: 0.1}, 8000.0)
     found = both_ways.both_ways(SETS, best, ONE_WAY.name, EVERY)
     assert [dict(start.strengths) for start in starts] == [
-        {VISCOUS: 0.1, DRY: 0.2, PUSH: 0.0},
-        {VISCOUS: 0.1, SOFT: 0.2, PUSH: 0.0},
+        {VISCOUS: 0.1, dry: 0.2, push: 0.0} for dry in (DRY, SOFT) for push in (PUSH, FORCE)
     ]
-    assert len(found) == 2
+    assert len(found) == 4
 
 
 @pytest.mark.parametrize(
@@ -54,7 +56,8 @@ def test_half_of_friction_in_one_direction_is_tried_in_both_in_all_forms_beside_
         ({ONE_WAY: 0.4}, 1900.0, ONE_WAY.name),  # little more than noise, which leaves 400
         ({VISCOUS: 0.4}, 8000.0, VISCOUS.name),
         ({ONE_WAY: 0.4, PUSH: 0.1}, 8000.0, ONE_WAY.name),  # a push there already
-        ({ONE_WAY: 0.4, DRY: 0.1, SOFT: 0.1}, 8000.0, ONE_WAY.name),
+        ({ONE_WAY: 0.4, DRY: 0.1}, 8000.0, ONE_WAY.name),
+        ({ONE_WAY: 0.4, BENT: 0.1}, 8000.0, ONE_WAY.name),  # in a form that was fitted
     ],
 )
 def test_it_is_not_tried_where_nothing_asks_for_it(started, strengths, deviance, name):

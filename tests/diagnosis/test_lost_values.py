@@ -210,7 +210,7 @@ def test_losses_beside_an_effect_that_explain_what_they_spoil_are_found(
     ("size", "effect", "found"),
     [(1.0, PacketDrop, True), (0.7, PacketDrop, False), (0.7, SensorDropout, True)],
 )
-def test_every_command_that_is_lost_beside_an_effect_is_seen(size, effect, found):
+def test_commands_that_are_lost_beside_an_effect_are_seen_where_they_are(size, effect, found):
     """A law that is a little wrong everywhere looks like many losses, hardly one of them sure."""
     rng = np.random.default_rng(0)
     splits = "train", "validation", "test"

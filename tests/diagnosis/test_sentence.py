@@ -95,6 +95,7 @@ def test_a_law_that_bends_is_said_to(form, said):
         ("viscous_friction", {"rise": -0.1}, ", and -0.1 of it per unit of speed"),
         ("viscous_friction", {"rise": 0.0}, ""),
         ("quadratic_drag", {"power": 2.0}, ""),  # as its name says
+        ("quadratic_drag", {"power": 1.996}, ""),
         ("quadratic_drag", {"power": 2.2}, ", by the power 2.2 of speed"),
         ("drag_of_my_own", {"power": 2.0}, ", by the power 2 of speed"),
     ],

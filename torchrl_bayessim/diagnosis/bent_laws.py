@@ -1,7 +1,8 @@
-"""Laws that fit better than the best explanation and predict worse, bent to the data.
+"""Laws that fit better than the best explanation, bent to the data.
 
-The length of a wave that is not quite the true one fits the way that a joint went in some runs, and
-not how far it went in others. What is judged by other runs loses to whatever errs in both alike.
+They lost because they predict worse: the length of a wave that is not quite the true one fits the
+way that a joint went in some runs, and not how far it went in others. What is judged by other runs
+loses to whatever errs in both alike.
 """
 
 from __future__ import annotations

@@ -30,22 +30,33 @@ def both_ways(
         sets: Where models are fitted, and where they are judged.
         best: The model.
         name: Its effect that is replaced: nothing is, unless it is friction in one direction of one
-            joint, and more than noise is left.
+            joint with neither the other nor a push, and more than noise is left.
         units: The effects to consider, dry friction in each of its forms.
     """
     mine = [unit for unit in best.units if unit.name == name]
     if name != DirectionalFriction.name or len(mine) != 1 or best.mean_square < _LEFT:
         return []
     robot, strengths = sets[0].predictor.system.robot, best.fit.point.strengths
-    here = [u for u in units if u.joint(robot) == mine[0].joint(robot) >= 0]
-    dry = [u for u in here if u.name == CoulombFriction.name and u not in best.units]
-    pushes = [u for u in here if isinstance(u.effect, ActionBias | ConstantForce)]
+    here, there = (
+        [u for u in some if u.joint(robot) == mine[0].joint(robot) >= 0]
+        for some in (units, best.units)
+    )
+    if any(_is_dry(unit) or _pushes(unit) for unit in there):
+        return []
+    dry, pushes = filter(_is_dry, here), list(filter(_pushes, here))
     half, kept = abs(strengths[mine[0]]) / 2, {u: s for u, s in strengths.items() if u != mine[0]}
     starts = [
         replace(best.fit.point, strengths={**kept, unit: unit.inside(half), push: 0.0})
         for unit in dry
         for push in pushes
-        if push not in kept
     ]
     found = judged_fits(*sets, starts) if starts else []
     return [model for model in found if takes_most(best, model)]
+
+
+def _is_dry(unit: Unit) -> bool:
+    return unit.name == CoulombFriction.name
+
+
+def _pushes(unit: Unit) -> bool:
+    return isinstance(unit.effect, ActionBias | ConstantForce)

@@ -127,9 +127,22 @@ def with_forms_anew(
     if not shifts:
         return bent
     changes = [_nearest_offered(shift, offered) - value_of(shift) for shift in shifts]
-    (straight,) = judged_fits(*sets, [_with(model.fit.point, shifts, changes)])
+    start = _of_offered_kinds(_with(model.fit.point, shifts, changes), offered)
+    (straight,) = judged_fits(*sets, [start])
     straight = with_fitted_forms(*sets, straight, offered, race=race)
     return straight if straight.fit.cost < bent.fit.cost + price(model) else bent
+
+
+def _of_offered_kinds(point: Point, offered: Collection[Unit]) -> Point:
+    """Return the point with offered laws in the place of those of a kind that was not offered."""
+    kinds = {type(unit.effect) for unit in offered}
+    plain = {(u.name, u.where, u.direction): u for u in reversed(list(offered))}
+    strengths = {}
+    for unit, strength in point.strengths.items():
+        there = unit.name, unit.where, unit.direction
+        other = unit if type(unit.effect) in kinds else plain.get(there, unit)
+        strengths[other] = other.inside(strength)
+    return Point(point.z, strengths)
 
 
 def _nearest_offered(shift: Shift, offered: Collection[Unit]) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..effects.action import ActionDelay
 from ..effects.backlash import Backlash
-from ..effects.friction import QuadraticDrag
+from ..effects.friction import PowerLawFriction, QuadraticDrag
 from ..effects.joints import CoulombFriction, ParallelSpring, ViscousFriction
 from .choice import chosen
 from .explanations import compare
@@ -32,7 +32,7 @@ _DRAWS, _RARELY = 1000, 0.99  # of noise, and where the largest ratio of so many
 _MORE = 2.0  # times that: what a fit may explain and a screen does not
 _FORMS = CoulombFriction.group, Backlash.group
 _LATE = ActionDelay.group, Backlash.group  # of each other, and of what a drive that gives way does
-_SMOOTH = ViscousFriction, QuadraticDrag, ParallelSpring
+_SMOOTH = ViscousFriction, PowerLawFriction, QuadraticDrag, ParallelSpring
 
 
 def little_left(best: Model, p_value: float, train: Objective) -> bool:

@@ -52,14 +52,12 @@ _NEEDED, _LIKELY = 40.0, 6.0
 _EXPLAINED = 0.5  # of the excess of the segments concerned, by what is left of them
 _CLEARLY = 0.1  # of it may be left of what is found clearly
 _ELSEWHERE = 0.5  # of what lost commands of a drive explain, by those of another
-_JUDGED = (
-    0.15  # of the deviance that losses explain in runs of the fit, by those in runs that judge
-)
+_AS_MUCH = 0.15  # of what losses explain in the runs of the fit, by those in runs that judge
 _FEW = 0.1  # of the deviance that such losses explain: what they may cost in runs without any
 _BIASED = 0.1  # of the excess of the segments concerned, which parameters leave in all
 _OTHERS = 1 / 6  # of the segments that something else may have spoiled
 _REMAIN = 0.6  # or of those that were spoiled without losses
-_SEEN = 4.0  # deviance that losses beside an effect explain in each segment that has them
+_SEEN = 4.0  # deviance that losses beside an effect explain in a segment that has them, on average
 _LONE = 0.2  # of what lost samples of a sensor explain, by those of any other
 EVIDENT, WRONG = 100.0, 0.3  # deviance, to be evident, and segments that losses do not explain
 _LATE = ActionDelay.group
@@ -182,8 +180,8 @@ def found_beside(
     """Return the losses of a unit beside others, nothing if they do not explain what they spoil.
 
     Commands beside an effect have to leave nothing of what they spoil, to be no more than is
-    plausible, and to be evident, each of them: a force law that is not quite the true one errs
-    everywhere a little, as if ever so many of them were.
+    plausible, and to be evident, as one of them is on average, too: a force law that is not quite
+    the true one errs everywhere a little, as if ever so many of them were.
     """
     return _Losses.of(data, unit, alone).explaining(alone, others)
 
@@ -271,7 +269,7 @@ def _explain(
     # where losses come in bursts, the runs that judge may have had hardly any; and a few segments
     # that something else spoils look a little like losses, in the runs where they are
     least = -max(_LIKELY, _FEW * gains[0] if surely else 0.0)
-    if gains[1] < (_JUDGED * gains[0] if others and not clear else least):
+    if gains[1] < (_AS_MUCH * gains[0] if others and not clear else least):
         return False
     # parameters that were fitted without losses are a little off everywhere
     noise = max(NOISE, min(LEFT, 1.0 + _BIASED * before))
@@ -280,6 +278,6 @@ def _explain(
         return False  # something else is wrong everywhere, and may look like this
     if after > _EXPLAINED * before:
         return False
-    one_by_one = losses.gain > _SEEN * concerned.sum()
-    plausible = clear and one_by_one and law.share <= unit.high
+    seen = losses.gain > _SEEN * concerned.sum()
+    plausible = clear and seen and law.share <= unit.high
     return plausible or not (others and isinstance(unit.effect, PacketDrop))

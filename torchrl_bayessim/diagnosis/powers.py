@@ -1,4 +1,4 @@
-"""Dampings that bend by a power of speed, in the place of those that bend in proportion to it.
+"""A damping that bends by a power of speed, in the place of one that bends in proportion to it.
 
 A lubricant that thins rubs by a power of speed below 1, which is steep at rest. In proportion to
 speed it is that nowhere, and what it lacks near rest looks like dry friction.
@@ -20,15 +20,20 @@ _MIDDLE = 0.3  # of the largest speed: where both laws are the same
 
 
 def by_power(train: Objective, model: Model) -> Point | None:
-    """Return a model's point with laws of a power for dampings that are bent, if any."""
-    strengths = dict(model.fit.point.strengths)
-    bent = [s for s in shifts_of(train, strengths) if isinstance(s.unit.effect, ViscousFriction)]
-    for shift in bent:
-        rise, speed = value_of(shift), _MIDDLE / shift.most
-        if rise:
-            law = PowerLawFriction.like(rise, speed)
-            same = strengths.pop(shift.unit) * (1.0 + rise * speed) * speed ** (1.0 - law.power)
-            unit = replace(shift.unit, effect=law)
-            strengths[unit] = unit.inside(same)
-    moved = strengths.keys() != model.fit.point.strengths.keys()
-    return Point(model.fit.point.z, strengths) if moved else None
+    """Return a model's point with the law of a power for a damping that is bent, if there is one.
+
+    Only where it is the one damping of the model: strengths of laws of several powers, or of these
+    and straight ones, are no strengths of one effect.
+    """
+    strengths = model.fit.point.strengths
+    every = [unit for unit in strengths if unit.name == ViscousFriction.name]
+    shifts = [s for s in shifts_of(train, every) if isinstance(s.unit.effect, ViscousFriction)]
+    if len(every) != 1 or not shifts or not value_of(shifts[0]):
+        return None
+    (bent,), (shift,) = every, shifts
+    rise, speed = value_of(shift), _MIDDLE / shift.most
+    law = PowerLawFriction.like(rise, speed)
+    unit = replace(bent, effect=law)
+    same = strengths[bent] * (1.0 + rise * speed) * speed ** (1.0 - law.power)
+    instead = {bent: (unit, unit.inside(same))}
+    return Point(model.fit.point.z, dict(instead.get(u, (u, s)) for u, s in strengths.items()))

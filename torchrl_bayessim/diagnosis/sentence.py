@@ -202,9 +202,12 @@ def _described(effect: Finding) -> str:
 def _law(name: str, form: Mapping[str, Any]) -> str:
     """Return what tells a law from others of its name: how fast it oscillates, how it bends."""
     usual = CATALOGUE[name]().form if name in CATALOGUE else {}
-    bent = {n: x for n, x in form.items() if x and (n not in usual or x != usual[n])}
     shown = [text.format(form[number]) for number, text in _FORMS.items() if number in form]
-    return "".join(shown + [text.format(bent[n]) for n, text in _BENT.items() if n in bent])
+    for number, text in _BENT.items():
+        said = text.format(form[number]) if form.get(number) else ""
+        if number not in usual or said != text.format(usual[number]):
+            shown.append(said)
+    return "".join(shown)
 
 
 def _place(where: str) -> str:

@@ -33,7 +33,8 @@ from .robot import Robot
 _PRESLIDING = 0.005  # rad or m
 _ONSET = 0.1  # rad/s or m/s
 _SLOWEST = 1e-6  # of that
-_CREEP = 1e-3  # rad/s or m/s
+_CREEP = 0.01  # rad/s or m/s
+_FALLING = -0.5  # of a damping's force, at a velocity beyond which it falls with that
 _THINNEST, _THICKEST = 0.5, 1.5  # powers
 _SHARP = 0.005  # rad/s or m/s: an onset that no time step resolves
 
@@ -120,10 +121,12 @@ class StribeckFriction(ForceEffect):
 class _PowerLaw(ForceEffect):
     """A force ``−s v |v|ᵖ⁻¹``, as a damping.
 
-    Below a thousandth of a unit of speed the damping is what it is there.
+    With ``p`` below 1 that is as large at rest as at a speed of 0.01, and no larger: fluids that
+    thin with speed do not where they creep, and a damping without bound would be unstable.
     """
 
     def __init__(self, power: float) -> None:
+        check_number("power, of speed", power, above=0.0)
         self.power = power
 
     def forces(
@@ -161,7 +164,8 @@ class PowerLawFriction(_PowerLaw):
     """Damping ``−s v |v|ᵖ⁻¹`` by a lubricant that thins with speed, or thickens; N m s/rad.
 
     The power law of Ostwald (1925) and de Waele for such fluids, whose viscosity goes with the
-    power ``p − 1`` of the shear; ``s`` is the damping at a speed of 1. Up to 1.2 ``F_max / v_max``.
+    power ``p − 1`` of the shear; ``s`` is the damping at a speed of 1. Up to 1.2 ``F_max / v_max``,
+    whatever the power.
 
     Args:
         power: ``p``, 1 for a fluid that does neither; a diagnosis fits it.
@@ -172,19 +176,17 @@ class PowerLawFriction(_PowerLaw):
 
     name, unit, group = "viscous_friction", "N m s/rad", "friction"
 
-    def __init__(self, power: float) -> None:
-        check_number("power, of speed", power, above=0.0)
-        super().__init__(power)
-
     @classmethod
     def like(cls, rise: float, velocity: float) -> PowerLawFriction:
         """Return the law whose force bends as ``v (1 + r v)`` does at a velocity.
+
+        As nearly as powers of 0.5 to 1.5 do, beyond which a diagnosis fits none.
 
         Example:
             >>> PowerLawFriction.like(-0.1, velocity=2.0)
             PowerLawFriction(power=0.75)
         """
-        part = rise * velocity
+        part = max(rise * velocity, _FALLING)
         return cls(power=min(max(1.0 + part / (1.0 + part), _THINNEST), _THICKEST))
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
