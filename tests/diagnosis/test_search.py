@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 import pytest
-from plain_models import A, C, Unit, plain
+from plain_models import A, B, C, Unit, plain
 
 from torchrl_bayessim.diagnosis import search as searching
 from torchrl_bayessim.diagnosis.search import Search
@@ -68,11 +68,33 @@ def test_where_much_is_left_a_limit_is_led_to_and_what_is_alike_too(monkeypatch,
     monkeypatch.setattr(searching, "exactly", lambda _, __, model: model)
     monkeypatch.setattr(searching, "with_fitted_forms", lambda _, __, model, ___: model)
     monkeypatch.setattr(searching, "softened", softened)
+    monkeypatch.setattr(searching, "fitted_best", lambda *_: [])
     search = Scripted({}, {})
     search.sets, search.varied, search.tried, search.offered = ("train", "judge"), False, [], []
     found = search._explained(SimpleNamespace(base=plain([], 1e6).fit), lambda _: push)
     assert found is (soft if led else push)
     assert given == ([push, bias] if led else [])
+
+
+def test_laws_that_fit_best_are_bent_before_it_is_decided(monkeypatch):
+    push, wave, bent = plain([C], 900.0), plain([A], 1200.0), plain([B], 410.0)
+    asked = []
+
+    def fitted_best(_, better, models, __):
+        asked.append((better, list(models)))
+        return [bent]
+
+    monkeypatch.setattr(searching, "explanations", lambda *_: [])
+    monkeypatch.setattr(searching, "judged", lambda *_: [push, wave])
+    monkeypatch.setattr(searching, "exactly", lambda _, __, model: model)
+    monkeypatch.setattr(searching, "with_fitted_forms", lambda _, __, model, ___: model)
+    monkeypatch.setattr(searching, "fitted_best", fitted_best)
+    search = Scripted({}, {})
+    search.sets, search.varied, search.tried, search.offered = ("train", "judge"), False, [], []
+    best = lambda models: min(models, key=lambda model: model.mean_square)
+    assert search._explained(SimpleNamespace(base=plain([], 1e6).fit), best) is bent
+    assert asked == [(push, [push, wave])]
+    assert bent in search.tried
 
 
 @pytest.mark.parametrize(
