@@ -143,13 +143,15 @@ def command_slopes(
     nudge = others - now
     nudge = np.where(np.abs(nudge) < _SAME * least, -least * np.sign(now), nudge)
     nudge = np.where(nudge == 0, -least, nudge)
-    slopes = []
-    for t in range(segments.horizon):
-        ctrl = segments.ctrl.copy()
-        ctrl[:, at + t, actuator] += nudge[:, t]
-        moved = objective.along(replace(segments, ctrl=ctrl))([point])[0]
-        slopes.append((moved - left) / nudge[:, t, None])
-    return np.stack(slopes, -1)
+    count, steps = nudge.shape
+    each = segments.take(np.tile(np.arange(count), steps))
+    ctrl = each.ctrl.copy().reshape(steps, *segments.ctrl.shape)
+    every = np.arange(steps)
+    ctrl[every, :, at + every, actuator] += nudge.T
+    raw = objective.along(replace(each, ctrl=ctrl.reshape(each.ctrl.shape))).raw([point])
+    raw = raw.reshape(steps, count, *raw.shape[2:])
+    moved = objective.innovations([point] * steps, raw)
+    return np.moveaxis((moved - left) / nudge.T[..., None], 0, -1)
 
 
 def steps_of(prepared: Prepared) -> int:

@@ -231,9 +231,13 @@ class Objective:
 
     def __call__(self, points: Sequence[Point], offsets: Array | None = None) -> Array:
         """Return weighted innovations, shape ``(P, S, KC)``."""
+        return self.innovations(points, self.raw(points, offsets))
+
+    def innovations(self, points: Sequence[Point], raw: Array) -> Array:
+        """Return weighted innovations of residuals ``(P, S, K, C)``, shape ``(P, S, KC)``."""
         share = np.array([point.z[-1] for point in points])
         drift = self.whitening.drift * self.whitening.weights[:, None]
-        return self.whitening(self.raw(points, offsets)) - share[:, None, None] * drift
+        return self.whitening(raw) - share[:, None, None] * drift
 
     def made_by_noise(
         self, point: Point, noise: Array, *, draws: int, generator: np.random.Generator

@@ -358,11 +358,18 @@ class Predictor:
             return Readings(**{n: torch.from_numpy(v) for n, v in tiled.items()})
 
         memories = self._forcing.start(active, measured(0))
+        # what neither remembers nor changes commands changes no memory
+        told = [
+            i
+            for i, (effect, _) in enumerate(active)
+            if memories[i] or effect.stage < ForceEffect.stage
+        ]
         if any(memories):
+            some, kept = [active[i] for i in told], [memories[i] for i in told]
             for k in range(segments.history):
-                _, memories = self._forcing(
-                    active, memories, measured(k), timestep=self.system.task.dt
-                )
+                _, kept = self._forcing(some, kept, measured(k), timestep=self.system.task.dt)
+            for i, memory in zip(told, kept, strict=True):
+                memories[i] = memory
         return memories
 
     def _write(self, theta: Array, strengths: Strengths) -> None:
