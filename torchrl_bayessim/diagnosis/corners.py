@@ -66,7 +66,7 @@ def is_corner(unit: Unit, shift: Shift) -> bool:
     The same effect at the same place, the same but for that number, which is 0 or which it has not.
     """
     soft = shift.unit
-    if (unit.name, unit.where, unit.direction) != (soft.name, soft.where, soft.direction):
+    if unit.place != soft.place:
         return False
     mine, others = dict(unit.effect.form), dict(soft.effect.form)
     del others[shift.number]

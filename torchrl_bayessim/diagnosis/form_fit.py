@@ -136,11 +136,10 @@ def with_forms_anew(
 def _of_offered_kinds(point: Point, offered: Collection[Unit]) -> Point:
     """Return the point with offered laws in the place of those of a kind that was not offered."""
     kinds = {type(unit.effect) for unit in offered}
-    plain = {(u.name, u.where, u.direction): u for u in reversed(list(offered))}
+    plain = {unit.place: unit for unit in reversed(list(offered))}
     strengths = {}
     for unit, strength in point.strengths.items():
-        there = unit.name, unit.where, unit.direction
-        other = unit if type(unit.effect) in kinds else plain.get(there, unit)
+        other = unit if type(unit.effect) in kinds else plain.get(unit.place, unit)
         strengths[other] = other.inside(strength)
     return Point(point.z, strengths)
 

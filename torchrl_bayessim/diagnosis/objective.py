@@ -74,6 +74,11 @@ class Unit:
         return self.effect.name
 
     @property
+    def place(self) -> tuple[str, str, tuple[float, ...]]:
+        """What two units share that are one effect, in any form, at the same target."""
+        return self.name, self.where, self.direction
+
+    @property
     def targets(self) -> list[int]:
         """The numbers of the targets at which it acts."""
         return [target for target, part in enumerate(self.direction) if part]

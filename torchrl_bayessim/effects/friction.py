@@ -143,6 +143,9 @@ class QuadraticDrag(_PowerLaw):
 
     Args:
         power: ``p``; a diagnosis fits it.
+
+    Raises:
+        ValueError: ``power`` is not above 0.
     """
 
     name, unit, group = "quadratic_drag", "N m s²/rad²", "friction"
