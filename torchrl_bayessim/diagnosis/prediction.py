@@ -358,17 +358,12 @@ class Predictor:
             return Readings(**{n: torch.from_numpy(v) for n, v in tiled.items()})
 
         memories = self._forcing.start(active, measured(0))
-        # what neither remembers nor changes commands changes no memory
-        told = [
-            i
-            for i, (effect, _) in enumerate(active)
-            if memories[i] or effect.stage < ForceEffect.stage
-        ]
         if any(memories):
-            some, kept = [active[i] for i in told], [memories[i] for i in told]
+            kept = self._forcing.lasting(active, memories, measured(0))
+            some, told = [active[i] for i in kept], [memories[i] for i in kept]
             for k in range(segments.history):
-                _, kept = self._forcing(some, kept, measured(k), timestep=self.system.task.dt)
-            for i, memory in zip(told, kept, strict=True):
+                _, told = self._forcing(some, told, measured(k), timestep=self.system.task.dt)
+            for i, memory in zip(kept, told, strict=True):
                 memories[i] = memory
         return memories
 

@@ -64,6 +64,18 @@ class Forcing:
         velocity = self.velocity(state)
         return [effect.start(velocity) for effect, _ in active]
 
+    def lasting(self, active: Active, memories: Sequence[Memory], state: Readings) -> list[int]:
+        """Return which effects remember anything, or change commands that those see.
+
+        Memories are the same without the others.
+        """
+        now = self._now(state, self._timestep)
+        return [
+            i
+            for i, ((effect, strength), memory) in enumerate(zip(active, memories, strict=True))
+            if memory or "command" in effect.forces(strength, memory, now)[0]
+        ]
+
     def velocity(self, state: Readings) -> Tensor:
         """Return the joints' velocities, shape ``(*batch, J)``."""
         return state.qvel[..., self._dofs]
