@@ -357,9 +357,10 @@ class Predictor:
             tiled["ctrl"][:, moved] += tiled["qpos"][:, relative[moved]]
             return Readings(**{n: torch.from_numpy(v) for n, v in tiled.items()})
 
-        memories = self._forcing.start(active, measured(0))
+        first = measured(0)
+        memories = self._forcing.start(active, first)
         if any(memories):
-            kept = self._forcing.lasting(active, memories, measured(0))
+            kept = self._forcing.lasting(active, memories, first)
             some, told = [active[i] for i in kept], [memories[i] for i in kept]
             for k in range(segments.history):
                 _, told = self._forcing(some, told, measured(k), timestep=self.system.task.dt)
