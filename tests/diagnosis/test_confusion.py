@@ -213,3 +213,45 @@ def test_a_number_of_a_law_that_was_fitted_has_its_price(monkeypatch, gained, fr
     assert exchanged(best, found.alternatives, found.offered) is (best, bent)[front]
     sets = dict.fromkeys(("train", "validation"))
     assert settled(found, "com_shift", sets).best is (best, bent)[front]
+
+
+def held_aside(apart):
+    """Return a shift along two axes beside drag, and a payload that is held aside, as likely.
+
+    The drag beside the payload has a power of its own.
+    """
+    drag, other = (
+        Unit(effect("quadratic_drag", power=p), "hinge", (1.0,), 0.0, 1.0) for p in (1.7, 1.6)
+    )
+    shifts = [Unit(effect("com_shift"), f"arm {a}", (1.0,), -1.0, 1.0) for a in "xz"]
+    load = Unit(effect("payload", at_end=True, aside=-0.5), "arm", (1.0,), 0.0, 1.0)
+    left = model(1.0)
+    two, one = (
+        replace(
+            left,
+            fit=replace(left.fit, units=units, point=Point(np.zeros(1), dict.fromkeys(units, 0.5))),
+        )
+        for units in ((drag, *shifts), (other, load))
+    )
+    share = np.sqrt(1.0 + apart / float((one.validation**2).sum()))
+    one = replace(one, validation=share * one.validation)
+    plain = replace(load, effect=effect("payload", at_end=True))
+    found = replace(
+        selection(two), alternatives={"com_shift": (one,)}, offered=(drag, other, *shifts, plain)
+    )
+    return found, two, one
+
+
+@pytest.mark.parametrize(("apart", "front"), [(1.0, 1), (4.0, 0)])
+def test_one_place_comes_to_the_front_of_several_that_are_no_likelier(monkeypatch, apart, front):
+    monkeypatch.setattr(confusion, "parts", lambda *_: [])
+    monkeypatch.setattr(confusion, "without_idle", lambda *given: given[-1])
+    found, *models = held_aside(apart)
+    sets = dict.fromkeys(("train", "validation"))
+    assert settled(found, "com_shift", sets).best is models[front]
+
+
+def test_a_rival_beside_a_law_of_another_form_is_known_by_its_own_name():
+    found, _, one = held_aside(1.0)
+    assert confusion.stand_in(found, one) == "payload"
+    assert confusion_set(found, "com_shift") == ("com_shift", "payload")

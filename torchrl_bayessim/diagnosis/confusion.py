@@ -16,7 +16,7 @@ from .elimination import parts, without_idle
 from .exchange import leaves_less_to_do
 from .free_numbers import priced
 from .model import Model, as_good, judged_fits
-from .objective import Objective, Point
+from .objective import Objective, Point, Unit
 from .selection import Selection
 
 _SAME = 2.0  # of a deviance: what fits of one and the same law may differ by
@@ -134,7 +134,7 @@ def _another_form(selection: Selection, rival: Model, name: str, *, form: float)
     """Return whether a rival of the same group explains nearly all of the same."""
     best = selection.best
     mine = {kind(u.effect) for u in best.units if u.name == name}
-    others = {kind(u.effect) for u in rival.beyond(best)}
+    others = {kind(u.effect) for u in _instead(selection, rival)}
     groups = {u.effect.group for u in (*best.units, *rival.units) if kind(u.effect) in mine}
     least = form if len(groups) == 1 else max(form, _ELSEWHERE)
     return mine == others and _short(selection, rival) < least
@@ -148,7 +148,13 @@ def _short(selection: Selection, rival: Model) -> float:
 
 def stand_in(selection: Selection, rival: Model) -> str:
     """Return the effect that a rival has in the place of one of the best model's."""
-    return rival.beyond(selection.best)[0].name
+    return _instead(selection, rival)[0].name
+
+
+def _instead(selection: Selection, rival: Model) -> list[Unit]:
+    """Return what a rival has in the place of an effect, beside others whose laws it may bend."""
+    beyond = rival.beyond(selection.best)
+    return [unit for unit in beyond if unit.name not in selection.best.names] or beyond
 
 
 def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> Selection:
@@ -158,18 +164,20 @@ def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> S
     than noise is left, deviances count by so much less (quasi-likelihood, Wedderburn 1974), or the
     one with the most strengths would mend most of that. Of those that explain the same it is one of
     the likeliest group, all its effects together; of late commands and late sensors, the one with
-    fewer faults of sensors, which needs no names of channels to be put on a simulator; of twins,
-    such as a bias of commands and a constant force, the drive's, which is looked at first, and not
-    the one that rounding prefers. And of equals that leave the other effects more and less to make
-    up for, the one that leaves less.
+    fewer faults of sensors, which needs no names of channels to be put on a simulator; of a law at
+    one place, such as a payload that is held aside, and another at several, the one place; of
+    twins, such as a bias of commands and a constant force, the drive's, which is looked at first,
+    and not the one that rounding prefers. And of equals that leave the other effects more and less
+    to make up for, the one that leaves less.
     """
     equals = [selection.best, *rivals(selection, name)]
     costs = {model: _cost(model, selection) for model in equals}
     least = min(costs.values())
     same = [model for model in equals if costs[model] - least < _SAME]
     same = _of_the_likeliest_group(same, costs, selection, name)
-    first = min(same, key=lambda model: (_sensing(model), costs[model]))
-    twins = [m for m in same if _sensing(m) == _sensing(first) and costs[m] < costs[first] + _TWIN]
+    simple = {model: (_sensing(model), len(model.units)) for model in same}
+    first = min(same, key=lambda model: (*simple[model], costs[model]))
+    twins = [m for m in same if simple[m] == simple[first] and costs[m] < costs[first] + _TWIN]
     first = min(twins, key=lambda model: (-_driving(model), costs[model]))
     plainer = [m for m in equals if leaves_less_to_do(first, m) and _sensing(m) <= _sensing(first)]
     first = min(plainer, key=costs.__getitem__, default=first)
@@ -212,7 +220,7 @@ def _of_the_likeliest_group(
     group_of = {}
     for model in models:
         own = {unit for unit in model.units if unit.name == name}
-        unit = next(iter(own)) if own else model.beyond(selection.best)[0]
+        unit = next(iter(own)) if own else _instead(selection, model)[0]
         group_of[model] = group = kind(unit.effect)
         likely = groups.setdefault(group, {})
         odds = math.exp(-0.5 * (costs[model] - least))
@@ -228,7 +236,7 @@ def _beside(
     new = {u: s for u, s in first.fit.point.strengths.items() if u.name != name}
     starts = []
     for rival in rivals(selection, name, form=_FORM):
-        added = {u: rival.fit.point.strengths[u] for u in rival.beyond(selection.best)}
+        added = {u: rival.fit.point.strengths[u] for u in _instead(selection, rival)}
         starts.append(Point(rival.fit.point.z, {**new, **added}))
     if not starts:
         return ()
