@@ -1,4 +1,4 @@
-"""Two laws of dry friction at one joint are one friction, told once and simulated twice."""
+"""Two laws that are one cause, of friction or of lateness, are told once and simulated twice."""
 
 from types import SimpleNamespace
 
@@ -10,7 +10,12 @@ from test_doubts import TWO
 
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.objective import Point, units_of
-from torchrl_bayessim.diagnosis.one_cause import dry_friction, dry_friction_alarms
+from torchrl_bayessim.diagnosis.one_cause import (
+    dry_friction,
+    dry_friction_alarms,
+    lateness,
+    lateness_alarms,
+)
 from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.logs.system import System
@@ -20,13 +25,13 @@ LAWS = "coulomb_friction", "stribeck_friction"
 FIRST, SECOND = ROBOT.joints[:2]
 
 
-def found(places, names=LAWS):
-    """Return a model of two laws, each at a joint or at all."""
+def found(places, names=LAWS, strengths=(0.2, 0.1), robot=ROBOT):
+    """Return a model of two laws, each at a target or at all."""
     units = [
-        next(u for u in units_of([effect(name)], ROBOT) if u.where == place)
+        next(u for u in units_of([effect(name)], robot) if u.where == place)
         for name, place in zip(names, places, strict=True)
     ]
-    point = Point(np.zeros(1), dict(zip(units, (0.2, 0.1), strict=True)))
+    point = Point(np.zeros(1), dict(zip(units, strengths, strict=True)))
     names = dict.fromkeys(unit.name for unit in units).keys()
     return SimpleNamespace(units=tuple(units), names=names, fit=SimpleNamespace(point=point))
 
@@ -56,6 +61,40 @@ def test_an_alarm_tells_both_ends_of_the_curve():
     (alarm,) = dry_friction_alarms(found((FIRST, FIRST)), {LAWS[1]: LAWS[0]}, ROBOT)
     assert f"friction at {FIRST} fades with speed, from 0.3 to 0.2 N m" in alarm
     assert dry_friction_alarms(found((FIRST, FIRST)), {}, ROBOT) == []
+
+
+FILTERED = "sensor_lag", "sensor_delay"
+CHANNEL, OTHER = ROBOT.channels[:2]
+
+
+@pytest.mark.parametrize(
+    ("places", "strengths", "told"),
+    [
+        ((CHANNEL, CHANNEL), (0.06, 0.01), {FILTERED[1]: FILTERED[0]}),
+        ((CHANNEL, CHANNEL), (0.01, 0.06), {FILTERED[0]: FILTERED[1]}),
+        (("all", CHANNEL), (0.06, 0.01), {FILTERED[1]: FILTERED[0]}),
+        (("all", CHANNEL), (0.01, 0.09), {}),
+        ((CHANNEL, OTHER), (0.06, 0.01), {}),
+    ],
+)
+def test_a_filter_and_a_delay_of_one_sensor_are_one_lateness(places, strengths, told):
+    assert lateness(found(places, FILTERED, strengths), ROBOT) == told
+
+
+def test_lateness_of_commands_is_none_of_sensors():
+    robot = system().robot
+    motor, channel = robot.actuators[0], robot.channels[0]
+    one = found((motor, channel), ("action_lag", "sensor_delay"), robot=robot)
+    assert lateness(one, robot) == {}
+    one = found((motor, motor), ("action_lag", "action_delay"), robot=robot)
+    assert lateness(one, robot) == {"action_delay": "action_lag"}
+
+
+def test_an_alarm_tells_how_late_by_which_means():
+    one = found((CHANNEL, CHANNEL), FILTERED, (0.06, 0.01))
+    (alarm,) = lateness_alarms(one, {FILTERED[1]: FILTERED[0]}, ROBOT)
+    assert alarm.startswith(f"{CHANNEL} is late by 0.06 s of a filter and 0.01 s of delay")
+    assert lateness_alarms(one, {}, ROBOT) == []
 
 
 @pytest.mark.slow

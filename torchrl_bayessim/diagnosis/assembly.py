@@ -29,7 +29,13 @@ from .location import location
 from .model import Model
 from .objective import Objective, Point, Unit
 from .odd_runs import odd_run_alarms, odd_runs, run_errors, unexplained_run_alarms
-from .one_cause import dry_friction, dry_friction_alarms, told_together
+from .one_cause import (
+    dry_friction,
+    dry_friction_alarms,
+    lateness,
+    lateness_alarms,
+    told_together,
+)
 from .preparation import Prepared
 from .report import Candidate, Gap, Parameter, Report
 from .rollout import rollout_errors, worse_rollouts
@@ -134,6 +140,7 @@ def assemble(
         more += [
             *unsteady_offset_alarms(together),
             *dry_friction_alarms(best, together, system.robot),
+            *lateness_alarms(best, together, system.robot),
         ]
     names, measured = {effect.name for effect in found.effects}, found.measured
     left = measured.effects if names else measured.refit
@@ -173,7 +180,7 @@ def _causes(prepared: Prepared, selection: Selection) -> tuple[dict[str, float],
     best, robot = selection.best, prepared.predictor.system.robot
     credit = credit_of(selection)
     together = unsteady_offsets(best, prepared.sets["train"].segments, robot)
-    together |= dry_friction(best, credit, robot)
+    together |= dry_friction(best, credit, robot) | lateness(best, robot)
     return told_together(credit, together), together
 
 

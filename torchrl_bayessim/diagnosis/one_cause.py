@@ -5,18 +5,27 @@ The simulator keeps all of them: only the names are fewer.
 
 from __future__ import annotations
 
-__all__ = ["dry_friction", "dry_friction_alarms", "told_together"]
+__all__ = [
+    "dry_friction",
+    "dry_friction_alarms",
+    "lateness",
+    "lateness_alarms",
+    "told_together",
+]
 
 from collections.abc import Mapping
 
+from ..effects.action import ActionDelay, ActionLag
 from ..effects.friction import StribeckFriction
 from ..effects.joints import CoulombFriction
 from ..effects.robot import Robot
+from ..effects.sensors import SensorDelay, SensorLag
 from .cells import plain
 from .model import Model
 from .objective import at_targets
 
 _LAWS = CoulombFriction.name, StribeckFriction.name
+_LATE = (ActionLag.name, ActionDelay.name), (SensorLag.name, SensorDelay.name)
 
 
 def told_together(credit: Mapping[str, float], told: Mapping[str, str]) -> dict[str, float]:
@@ -48,7 +57,7 @@ def dry_friction(model: Model, credit: Mapping[str, float], robot: Robot) -> dic
     if not set(_LAWS) <= set(model.names):
         return {}
     first, second = sorted(_LAWS, key=lambda name: -credit[name])
-    there, others = (_by_joint(model, name, robot).keys() for name in (first, second))
+    there, others = (_by_target(model, name, robot).keys() for name in (first, second))
     return {second: first} if others <= there else {}
 
 
@@ -60,7 +69,7 @@ def dry_friction_alarms(model: Model, told: Mapping[str, str], robot: Robot) -> 
         told: What is told with another; by :func:`dry_friction`, and other effects.
         robot: Where they act.
     """
-    always, fading = (_by_joint(model, name, robot) for name in _LAWS)
+    always, fading = (_by_target(model, name, robot) for name in _LAWS)
     return [
         f"friction at {joint} fades with speed, from "
         f"{always[joint] + fading[joint]:.3g} to {always[joint]:.3g} {_measure(model, robot)}: in "
@@ -72,12 +81,52 @@ def dry_friction_alarms(model: Model, told: Mapping[str, str], robot: Robot) -> 
     ]
 
 
+def lateness(model: Model, robot: Robot) -> dict[str, str]:
+    """Return the delay that is told with a filter, or the other way round, and that other's name.
+
+    What several filters in a row do is nearly one filter and dead time (Skogestad 2003, the half
+    rule): one cause, where both are at the same actuators or sensors. It has the name of what makes
+    it later, of equal ones the filter's.
+
+    Args:
+        model: With the effects that were found.
+        robot: Where they act.
+    """
+    told: dict[str, str] = {}
+    for names in _LATE:
+        if set(names) <= set(model.names):
+            found = {name: _by_target(model, name, robot) for name in names}
+            first, second = sorted(names, key=lambda name: -sum(found[name].values()))
+            if found[second].keys() <= found[first].keys():
+                told[second] = first
+    return told
+
+
+def lateness_alarms(model: Model, told: Mapping[str, str], robot: Robot) -> list[str]:
+    """Return an alarm for what is late at one place, filtered and delayed.
+
+    Args:
+        model: With the effects that were found.
+        told: What is told with another; by :func:`lateness`, and other effects.
+        robot: Where they act.
+    """
+    return [
+        f"{place} is late by {filtered[place]:.3g} s of a filter and {delayed[place]:.3g} s of "
+        f"delay: in the simulator {plain(names[0])} and {plain(names[1])} stand for it together"
+        for names in _LATE
+        if told.get(names[0]) == names[1] or told.get(names[1]) == names[0]
+        for filtered, delayed in [[_by_target(model, name, robot) for name in names]]
+        for place in filtered
+        if place in delayed
+    ]
+
+
 def _measure(model: Model, robot: Robot) -> str:
     unit = next(unit for unit in model.units if unit.name in _LAWS)
     return unit.measured_in(robot)
 
 
-def _by_joint(model: Model, name: str, robot: Robot) -> dict[str, float]:
-    """Return the strength of a law at each joint where it acts."""
+def _by_target(model: Model, name: str, robot: Robot) -> dict[str, float]:
+    """Return the strength of a law at each target where it acts."""
     strengths = model.fit.point.strengths
     return at_targets({u: u.actual(strengths[u]) for u in model.units if u.name == name}, robot)
