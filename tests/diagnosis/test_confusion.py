@@ -7,7 +7,7 @@ import pytest
 
 from torchrl_bayessim.diagnosis import confusion
 from torchrl_bayessim.diagnosis.confusion import confusion_set, rivals, settled
-from torchrl_bayessim.diagnosis.exchange import exchanged, leaves_less_to_do
+from torchrl_bayessim.diagnosis.exchange import exchanged, leaves_less_to_do, only_more
 from torchrl_bayessim.diagnosis.model import Model
 from torchrl_bayessim.diagnosis.objective import Point, Unit
 from torchrl_bayessim.diagnosis.refit import Fit
@@ -101,7 +101,7 @@ def test_friction_one_way_and_half_of_it_as_a_push_is_friction_both_ways(monkeyp
     best, other = pair(1.0, **ONE_WAY), pair(1.001, **BOTH_WAYS)
     assert leaves_less_to_do(best, other)
     assert not leaves_less_to_do(other, best)
-    assert exchanged(best, {"directional_friction": (other,)}) is other
+    assert exchanged(model(11.0), best, {"directional_friction": (other,)}) is other
     monkeypatch.setattr(confusion, "parts", lambda *_: [])
     # also where it explains a little less, as long as that may be chance
     for one, name in ((best, "directional_friction"), (other, "coulomb_friction")):
@@ -210,7 +210,8 @@ def test_a_number_of_a_law_that_was_fitted_has_its_price(monkeypatch, gained, fr
     found = replace(
         selection(best), alternatives={"com_shift": (bent,)}, offered=(*best.units, *other.units)
     )
-    assert exchanged(best, found.alternatives, found.offered) is (best, bent)[front]
+    others = found.alternatives, found.offered
+    assert exchanged(found.nominal, best, *others) is (best, bent)[front]
     sets = dict.fromkeys(("train", "validation"))
     assert settled(found, "com_shift", sets).best is (best, bent)[front]
 
@@ -255,3 +256,28 @@ def test_a_rival_beside_a_law_of_another_form_is_known_by_its_own_name():
     found, _, one = held_aside(1.0)
     assert confusion.stand_in(found, one) == "payload"
     assert confusion_set(found, "com_shift") == ("com_shift", "payload")
+
+
+@pytest.mark.parametrize(
+    ("least", "gained", "front"), [(101.0, 20.0, 0), (101.0, 120.0, 1), (1.05, 20.0, 1)]
+)
+def test_more_places_have_to_explain_a_share_where_one_leaves_nothing(
+    monkeypatch, least, gained, front
+):
+    """Unless noise hides most of what either explains."""
+    monkeypatch.setattr(confusion, "parts", lambda *_: [])
+    monkeypatch.setattr(confusion, "without_idle", lambda *given: given[-1])
+    tilt, start = model(1.0, "gravity_tilt"), model(least)
+    units = tuple(Unit(effect("com_shift"), f"arm {a}", (1.0,), -1.0, 1.0) for a in "xz")
+    point = Point(np.zeros(1), dict.fromkeys(units, 0.5))
+    share = np.sqrt(1.0 - gained / float((tilt.validation**2).sum()))
+    shift = replace(
+        tilt, fit=replace(tilt.fit, units=units, point=point), validation=share * tilt.validation
+    )
+    found = Selection(start, tilt, (), (), (start, tilt, shift), {"gravity_tilt": (shift,)})
+    assert only_more(start, tilt, shift) is not bool(front)
+    assert exchanged(start, tilt, found.alternatives) is (tilt, shift)[front]
+    assert (
+        settled(found, "gravity_tilt", dict.fromkeys(("train", "validation"))).best
+        is (tilt, shift)[front]
+    )

@@ -111,7 +111,7 @@ def test_more_strengths_do_not_take_the_place_of_fewer_that_are_as_good(share, c
     each = rng.uniform(0.5, 1.5, len(best.validation))[:, None]  # better here, worse there
     fit = replace(more.fit, innovations=np.sqrt(share) * each * more.validation)
     other = Model(fit=fit, validation=fit.innovations, logs=more.logs)
-    assert (exchanged(best, {"gain": (other,)}) is other) == changed
+    assert (exchanged(plain([], 6000.0), best, {"gain": (other,)}) is other) == changed
 
 
 def test_a_model_of_fewer_effects_has_alternatives_of_its_own():

@@ -13,7 +13,7 @@ from ..effects.joints import Armature
 from ..effects.transmission import ServoDeadBand
 from .alternatives import kind
 from .elimination import parts, without_idle
-from .exchange import leaves_less_to_do
+from .exchange import leaves_less_to_do, only_more
 from .free_numbers import priced
 from .model import Model, as_good, judged_fits
 from .objective import Objective, Point, Unit
@@ -170,7 +170,8 @@ def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> S
     and not the one that rounding prefers. And of equals that leave the other effects more and less
     to make up for, the one that leaves less.
     """
-    equals = [selection.best, *rivals(selection, name)]
+    start, best = selection.nominal, selection.best
+    equals = [best, *(m for m in rivals(selection, name) if not only_more(start, best, m))]
     costs = {model: _cost(model, selection) for model in equals}
     least = min(costs.values())
     same = [model for model in equals if costs[model] - least < _SAME]

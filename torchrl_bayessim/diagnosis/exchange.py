@@ -2,35 +2,42 @@
 
 from __future__ import annotations
 
-__all__ = ["exchanged", "leaves_less_to_do"]
+__all__ = ["exchanged", "leaves_less_to_do", "only_more"]
 
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 
 from .free_numbers import priced
+from .further_effects import nothing_left
 from .model import LIKELY, Model, as_good, gain, needed, numbers
 from .objective import Unit
 
 _SMALLER = 0.75  # times: all strengths of an equal that is plainer
+_FORM = 2e-3  # of what is explained: what laws of a slightly other form leave
 _LESS = 0.5  # times: of what an effect did that made up for another
 
 
 def exchanged(
-    best: Model, others: Mapping[str, Sequence[Model]], offered: Collection[Unit] = ()
+    start: Model,
+    best: Model,
+    others: Mapping[str, Sequence[Model]],
+    offered: Collection[Unit] = (),
 ) -> Model:
     """Return the best of a model and its alternatives, itself unless chance is unlikely.
 
     Or unless one that is as good leaves less for the others to do (`leaves_less_to_do`).
 
     Args:
+        start: Parameters alone.
         best: The model.
         others: Its alternatives, by the effect in whose place they have another.
         offered: The effects as they were offered: numbers that were fitted have their price.
     """
     cost = partial(priced, offered=offered, dispersion=best.dispersion())
     every = [model for models in others.values() for model in models]
+    some = [m for m in every if not only_more(start, best, m)]
     candidates = [
-        m for m in every if len(m.units) <= len(best.units) or gain(best, m) > needed(best, m)
+        m for m in some if len(m.units) <= len(best.units) or gain(best, m) > needed(best, m)
     ]
     first = min([best, *candidates], key=cost)
     better_by = cost(best) - cost(first)
@@ -40,6 +47,18 @@ def exchanged(
         return first
     plainer = [m for m in every if leaves_less_to_do(best, m)]
     return min(plainer, key=cost, default=best)
+
+
+def only_more(start: Model, best: Model, other: Model) -> bool:
+    """Return whether another has more effects or places than a model that leaves nothing.
+
+    What is left is as little as a law of a slightly other form leaves, and more strengths mend some
+    of that whatever they are: a centre of mass that is shifted along two axes is more than a tilt.
+    So they have to explain a share of all that is explained.
+    """
+    explained, more = (float((m.deviances() - other.deviances()).sum()) for m in (start, best))
+    several = len(other.units) > len(best.units) and nothing_left(start, best)
+    return several and more < _FORM * explained
 
 
 def leaves_less_to_do(best: Model, other: Model) -> bool:

@@ -147,7 +147,7 @@ def _settled(search: Search, best: Model) -> tuple[Model, dict[str, tuple[Model,
         search.progress("trying others in its place")
         others = instead(best, tried=search.tried)
         search.tried += [model for models in others.values() for model in models]
-        better = exchanged(best, others, search.offered)
+        better = exchanged(search.start, best, others, search.offered)
         if better is best or exchanges == _EXCHANGES:
             return best, others
         best, dropped = eliminated(*search.sets, exactly(*search.sets, better))
