@@ -11,7 +11,7 @@ from __future__ import annotations
 
 __all__ = ["Shaken", "beside_jitter", "outdone"]
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +31,7 @@ from .objective import Objective, Point, Unit
 from .preparation import Prepared
 from .prepared_anew import with_other_logs
 from .scatter import Sent
+from .searching import Searching
 from .selection import Selection
 from .varying import widened
 
@@ -90,7 +91,7 @@ def beside_jitter(
     selection: Selection,
     units: Sequence[Unit],
     *,
-    search: Callable[..., tuple[Prepared, Selection]],
+    search: Searching,
     generator: np.random.Generator,
 ) -> Shaken | None:
     """Return jitter, and what lasts beside it, if they explain more than what was found.

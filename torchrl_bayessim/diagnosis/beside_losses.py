@@ -4,7 +4,7 @@ from __future__ import annotations
 
 __all__ = ["CERTAIN", "Beside", "Sought"]
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from .chance import Chance
 from .loss_suspects import Suspects
 from .preparation import Prepared
 from .scatter import Sent
+from .searching import Searching
 from .selection import Selection
 
 CERTAIN = 40.0  # deviance by which both together have to explain more than either
@@ -35,7 +36,7 @@ class Sought:
     selection: Selection
     found: Sequence[Chance]
     suspects: Suspects
-    search: Callable[..., tuple[Prepared, Selection]]
+    search: Searching
     generator: np.random.Generator
 
 

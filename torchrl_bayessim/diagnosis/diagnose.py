@@ -35,6 +35,7 @@ from .onsets import with_onsets
 from .preparation import Prepared, prepare
 from .prepared_anew import with_less_noise, with_less_trust
 from .report import Report
+from .searching import Searching
 from .selection import Selection, select
 from .shapes import SHAPED, shaped, with_shapes
 from .with_chance import with_chance
@@ -139,7 +140,7 @@ def diagnose(
 
 
 def _beside_noise(
-    search: Callable[..., tuple[Prepared, Selection]],
+    search: Searching,
     prepared: Prepared,
     generator: np.random.Generator,
 ) -> tuple[tuple[str, ...], Prepared, Selection]:

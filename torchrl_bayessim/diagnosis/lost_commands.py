@@ -12,7 +12,6 @@ from __future__ import annotations
 
 __all__ = ["beside_lost_commands"]
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +24,7 @@ from .evident_losses import Evident, evident, lost_beside
 from .model import WHITE, takes_most
 from .preparation import Prepared
 from .prepared_anew import with_other_logs
+from .searching import Searching
 from .selection import Selection
 
 _ROUNDS = 3  # of deciding which commands arrived and searching on
@@ -84,7 +84,7 @@ def _searched(
     sent: Selection,
     seen: Evident,
     *,
-    search: Callable[..., tuple[Prepared, Selection]],
+    search: Searching,
     generator: np.random.Generator,
 ) -> tuple[Prepared, Selection] | None:
     """Return what is found on the commands that arrived, if that explains more than as sent."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 __all__ = ["with_chance"]
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,10 +25,10 @@ from .objective import Unit
 from .preparation import Prepared
 from .scatter import Recorded, Scatter, Sent, gap_with_holds
 from .search import MANY
+from .searching import Searching
 from .selection import Selection
 from .varying import varying, with_variation
 
-Search = Callable[..., tuple[Prepared, Selection]]
 _AGAIN = 4  # steps of fits whose noise was another
 _LOST = 4  # samples of all runs, to be lost at all
 _REST = "{}, as it seems: that explains what remains"
@@ -42,7 +42,7 @@ def with_chance(
     units: Sequence[Unit],
     holds: Sequence[Hold],
     alarms: tuple[str, ...],
-    search: Search,
+    search: Searching,
     generator: np.random.Generator,
 ) -> tuple[Prepared, Selection, Scatter]:
     """Return what was found of chance, and of what lasts beside it.
@@ -54,7 +54,7 @@ def with_chance(
         units: Effects at their targets, those of chance among them.
         holds: Channels whose samples were not always renewed.
         alarms: From before that search.
-        search: Searches for effects that last.
+        search: Searchinges for effects that last.
         generator: Of simulated noise.
     """
     random, suspects = of_chance(units), Suspects.of(prepared, selection, units)
@@ -122,7 +122,7 @@ def _may_be_lost_beside(unit: Unit, best: Model) -> bool:
 
 
 def _beside_variation(
-    search: Search, prepared: Prepared, selection: Selection, random: Sequence[Unit]
+    search: Searching, prepared: Prepared, selection: Selection, random: Sequence[Unit]
 ) -> tuple[Prepared, Selection]:
     """Return what is found beside effects that vary by chance; the same if it is no more.
 
