@@ -92,6 +92,7 @@ def test_a_share_that_may_be_nothing_is_named_with_reserve(low, verdict):
         helps=False,
         together=False,
         several=False,
+        remains=False,
     )
     assert weighed.named(ambiguous=False) == verdict
 

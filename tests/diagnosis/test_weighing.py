@@ -20,16 +20,19 @@ def with_fit(model, first, others):
 
 def verdict(
     *, refit, left, sure, chance=False, validation=(1.0, 0.99), raw=9.0, ci=(-2.0, 1.0), count=1,
-    by_chance=1.0, laws=1, guessed=False, strength=(0.1, 0.3), fitted=None,
+    by_chance=1.0, laws=1, guessed=False, strength=(0.1, 0.3), fitted=None, rest=None, further=(),
 ):  # fmt: skip
     """Return the verdict on one effect: mean squared innovations of test runs and validation.
 
     Segments of the fit have those of validation, or before and after what ``fitted`` says of each.
+    What is left of test runs beyond noise is known well, or within ``rest``; ``further`` are the
+    p-values of further rounds of the search.
     """
     explained = (refit - left) / max(refit - 1.0, 1e-9)
     share = float(np.clip(explained, -1.0, 1.0))
     excess = (-0.2, 0.3) if refit < 1.05 else (0.5 * (refit - 1.0), 2 * refit)
-    measured = Shrinkage(raw, refit, left, share, ci, excess, (left - 1.1, left - 0.9), by_chance)
+    rest = rest or (left - 1.1, left - 0.9)
+    measured = Shrinkage(raw, refit, left, share, ci, excess, rest, by_chance)
     units = (A, C)[:laws]
     models = [
         plain(there, 4000 * mean, segments=40, width=100)
@@ -38,7 +41,7 @@ def verdict(
     if fitted is not None:
         models = [with_fit(model, *means) for model, means in zip(models, fitted, strict=True)]
     found = SimpleNamespace(
-        p_values=[1.0 if chance else sure],
+        p_values=[1.0 if chance else sure, *further],
         nominal=models[0],
         best=models[0] if chance else models[1],
         offered=(A,) * 200,
@@ -52,6 +55,20 @@ def verdict(
         guessed=guessed,
     )
     return weighed.named(ambiguous=False)
+
+
+@pytest.mark.parametrize(
+    ("left", "further", "said"),
+    [
+        (1.9, (0.3,), "named"),  # more than noise is left, or not: few segments say little of it
+        (1.9, (1e-30,), "named_partial"),  # and the runs of the search are sure of it
+        (1.9, (1e-30, 0.3), "named"),  # which needed more
+        (1.05, (1e-30,), "named"),  # of next to nothing
+    ],
+)
+def test_what_the_search_is_sure_is_missing_is_left_of_test_runs(left, further, said):
+    known = {"refit": 6.0, "sure": 1e-60, "ci": (0.75, 1.0), "rest": (-0.5, 2.0)}
+    assert verdict(left=left, further=further, **known) == said
 
 
 @pytest.mark.parametrize(
