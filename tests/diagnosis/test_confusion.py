@@ -259,7 +259,7 @@ def test_a_rival_beside_a_law_of_another_form_is_known_by_its_own_name():
 
 
 @pytest.mark.parametrize(
-    ("least", "gained", "front"), [(101.0, 20.0, 0), (101.0, 120.0, 1), (1.05, 20.0, 1)]
+    ("least", "gained", "front"), [(101.0, 70.0, 0), (101.0, 90.0, 1), (1.05, 20.0, 1)]
 )
 def test_more_places_have_to_explain_a_share_where_one_leaves_nothing(
     monkeypatch, least, gained, front
@@ -281,3 +281,10 @@ def test_more_places_have_to_explain_a_share_where_one_leaves_nothing(
         settled(found, "gravity_tilt", dict.fromkeys(("train", "validation"))).best
         is (tilt, shift)[front]
     )
+
+
+def test_where_much_is_left_more_places_may_explain_hardly_more():
+    start = model(1001.0)
+    for left, more, alone in ((20.0, 19.5, False), (1.1, 0.6, True)):
+        one = model(left, "gravity_tilt")
+        assert only_more(start, one, model(more, "gravity_tilt", "com_shift")) is alone

@@ -73,7 +73,9 @@ CHANNEL, OTHER = ROBOT.channels[:2]
         ((CHANNEL, CHANNEL), (0.06, 0.01), {FILTERED[1]: FILTERED[0]}),
         ((CHANNEL, CHANNEL), (0.01, 0.06), {FILTERED[0]: FILTERED[1]}),
         (("all", CHANNEL), (0.06, 0.01), {FILTERED[1]: FILTERED[0]}),
-        (("all", CHANNEL), (0.01, 0.09), {}),
+        ((CHANNEL, CHANNEL), (0.03, 0.03), {FILTERED[1]: FILTERED[0]}),
+        (("all", CHANNEL), (0.01, 0.09), {FILTERED[1]: FILTERED[0]}),  # at more of them
+        ((CHANNEL, "all"), (0.06, 0.01), {FILTERED[0]: FILTERED[1]}),
         ((CHANNEL, OTHER), (0.06, 0.01), {}),
     ],
 )
@@ -90,8 +92,22 @@ def test_lateness_of_commands_is_none_of_sensors():
     assert lateness(one, robot) == {"action_delay": "action_lag"}
 
 
-def test_an_alarm_tells_how_late_by_which_means():
-    one = found((CHANNEL, CHANNEL), FILTERED, (0.06, 0.01))
+def test_commands_and_sensors_may_both_be_late():
+    robot = system().robot
+    motor, channel = robot.actuators[0], robot.channels[0]
+    names = "action_delay", "action_lag", "sensor_lag", "sensor_delay"
+    places, strengths = (motor, motor, channel, channel), (0.02, 0.01, 0.01, 0.02)
+    told = {"action_lag": "action_delay", "sensor_lag": "sensor_delay"}
+    one = found(places, names, strengths, robot=robot)
+    assert lateness(one, robot) == told
+    commands, sensors = lateness_alarms(one, told, robot)
+    assert commands.startswith(f"{motor} is late by 0.01 s of a filter and 0.02 s of delay")
+    assert sensors.startswith(f"{channel} is late by 0.01 s of a filter and 0.02 s of delay")
+    assert "sensor lag and sensor delay stand for it together" in sensors
+
+
+def test_an_alarm_tells_where_both_are():
+    one = found(("all", CHANNEL), FILTERED, (0.06, 0.01))
     (alarm,) = lateness_alarms(one, {FILTERED[1]: FILTERED[0]}, ROBOT)
     assert alarm.startswith(f"{CHANNEL} is late by 0.06 s of a filter and 0.01 s of delay")
     assert lateness_alarms(one, {}, ROBOT) == []

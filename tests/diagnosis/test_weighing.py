@@ -20,13 +20,13 @@ def with_fit(model, first, others):
 
 def verdict(
     *, refit, left, sure, chance=False, validation=(1.0, 0.99), raw=9.0, ci=(-2.0, 1.0), count=1,
-    by_chance=1.0, laws=1, guessed=False, strength=(0.1, 0.3), fitted=None, rest=None, further=(),
+    by_chance=1.0, laws=1, guessed=False, strength=(0.1, 0.3), fitted=None, rest=None, missing=1.0,
 ):  # fmt: skip
     """Return the verdict on one effect: mean squared innovations of test runs and validation.
 
     Segments of the fit have those of validation, or before and after what ``fitted`` says of each.
-    What is left of test runs beyond noise is known well, or within ``rest``; ``further`` are the
-    p-values of further rounds of the search.
+    What is left of test runs beyond noise is known well, or within ``rest``; ``missing`` is how
+    often noise would make the search miss something.
     """
     explained = (refit - left) / max(refit - 1.0, 1e-9)
     share = float(np.clip(explained, -1.0, 1.0))
@@ -41,7 +41,8 @@ def verdict(
     if fitted is not None:
         models = [with_fit(model, *means) for model, means in zip(models, fitted, strict=True)]
     found = SimpleNamespace(
-        p_values=[1.0 if chance else sure, *further],
+        p_values=[1.0 if chance else sure],
+        missing=missing,
         nominal=models[0],
         best=models[0] if chance else models[1],
         offered=(A,) * 200,
@@ -57,18 +58,30 @@ def verdict(
     return weighed.named(ambiguous=False)
 
 
+SURE = {"refit": 6.0, "sure": 1e-60, "ci": (0.75, 1.0)}
+
+
 @pytest.mark.parametrize(
-    ("left", "further", "said"),
+    ("left", "rest", "missing", "said"),
     [
-        (1.9, (0.3,), "named"),  # more than noise is left, or not: few segments say little of it
-        (1.9, (1e-30,), "named_partial"),  # and the runs of the search are sure of it
-        (1.9, (1e-30, 0.3), "named"),  # which needed more
-        (1.05, (1e-30,), "named"),  # of next to nothing
+        (1.9, (-0.5, 2.0), 1e-3, "named"),  # more than noise is left, or not: few segments say so
+        (1.9, (-0.5, 2.0), 1e-5, "named_partial"),  # and the runs of the search are sure of it
+        (1.1, (-0.5, 2.0), 1e-5, "named"),  # of next to nothing of the gap
+        (1.02, (-0.01, 0.04), 1e-5, "named"),  # of what no one would chase, say test runs
     ],
 )
-def test_what_the_search_is_sure_is_missing_is_left_of_test_runs(left, further, said):
-    known = {"refit": 6.0, "sure": 1e-60, "ci": (0.75, 1.0), "rest": (-0.5, 2.0)}
-    assert verdict(left=left, further=further, **known) == said
+def test_what_the_search_is_sure_is_missing_is_left_of_test_runs(left, rest, missing, said):
+    assert verdict(left=left, rest=rest, missing=missing, **SURE) == said
+
+
+def test_test_runs_alone_say_that_next_to_nothing_is_left():
+    known = {"refit": 1.6, "left": 1.02, "sure": 1e-60, "ci": (0.75, 1.0), "missing": 1e-30}
+    assert verdict(rest=(-0.01, 0.04), **known) == "named"
+    assert verdict(rest=(-0.01, 0.06), **known) == "named_partial"
+
+
+def test_what_chance_does_is_no_effect_that_the_search_misses():
+    assert verdict(left=1.9, rest=(-0.5, 2.0), missing=1e-30, chance=True, **SURE) == "named"
 
 
 @pytest.mark.parametrize(

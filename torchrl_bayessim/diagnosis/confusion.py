@@ -16,7 +16,7 @@ from .elimination import parts, without_idle
 from .exchange import leaves_less_to_do, only_more
 from .free_numbers import priced
 from .model import Model, as_good, judged_fits
-from .objective import Objective, Point, Unit
+from .objective import Objective, Point
 from .selection import Selection
 
 _SAME = 2.0  # of a deviance: what fits of one and the same law may differ by
@@ -134,7 +134,7 @@ def _another_form(selection: Selection, rival: Model, name: str, *, form: float)
     """Return whether a rival of the same group explains nearly all of the same."""
     best = selection.best
     mine = {kind(u.effect) for u in best.units if u.name == name}
-    others = {kind(u.effect) for u in _instead(selection, rival)}
+    others = {kind(u.effect) for u in rival.instead(selection.best)}
     groups = {u.effect.group for u in (*best.units, *rival.units) if kind(u.effect) in mine}
     least = form if len(groups) == 1 else max(form, _ELSEWHERE)
     return mine == others and _short(selection, rival) < least
@@ -148,13 +148,7 @@ def _short(selection: Selection, rival: Model) -> float:
 
 def stand_in(selection: Selection, rival: Model) -> str:
     """Return the effect that a rival has in the place of one of the best model's."""
-    return _instead(selection, rival)[0].name
-
-
-def _instead(selection: Selection, rival: Model) -> list[Unit]:
-    """Return what a rival has in the place of an effect, beside others whose laws it may bend."""
-    beyond = rival.beyond(selection.best)
-    return [unit for unit in beyond if unit.name not in selection.best.names] or beyond
+    return rival.instead(selection.best)[0].name
 
 
 def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> Selection:
@@ -221,7 +215,7 @@ def _of_the_likeliest_group(
     group_of = {}
     for model in models:
         own = {unit for unit in model.units if unit.name == name}
-        unit = next(iter(own)) if own else _instead(selection, model)[0]
+        unit = next(iter(own)) if own else model.instead(selection.best)[0]
         group_of[model] = group = kind(unit.effect)
         likely = groups.setdefault(group, {})
         odds = math.exp(-0.5 * (costs[model] - least))
@@ -237,7 +231,7 @@ def _beside(
     new = {u: s for u, s in first.fit.point.strengths.items() if u.name != name}
     starts = []
     for rival in rivals(selection, name, form=_FORM):
-        added = {u: rival.fit.point.strengths[u] for u in _instead(selection, rival)}
+        added = {u: rival.fit.point.strengths[u] for u in rival.instead(selection.best)}
         starts.append(Point(rival.fit.point.z, {**new, **added}))
     if not starts:
         return ()

@@ -13,7 +13,7 @@ from .model import LIKELY, Model, as_good, gain, needed, numbers
 from .objective import Unit
 
 _SMALLER = 0.75  # times: all strengths of an equal that is plainer
-_FORM = 2e-3  # of what is explained: what laws of a slightly other form leave
+_SLIGHTLY = 2e-3  # of what is explained: what laws of a slightly other form leave
 _LESS = 0.5  # times: of what an effect did that made up for another
 
 
@@ -25,7 +25,8 @@ def exchanged(
 ) -> Model:
     """Return the best of a model and its alternatives, itself unless chance is unlikely.
 
-    Or unless one that is as good leaves less for the others to do (`leaves_less_to_do`).
+    Of those with more units, where it leaves nothing, only what explains a share (`only_more`). Or
+    unless one that is as good leaves less for the others to do (`leaves_less_to_do`).
 
     Args:
         start: Parameters alone.
@@ -45,12 +46,12 @@ def exchanged(
         return best  # something is wrong with both, and more strengths mend more of it
     if better_by > LIKELY:
         return first
-    plainer = [m for m in every if leaves_less_to_do(best, m)]
+    plainer = [m for m in some if leaves_less_to_do(best, m)]
     return min(plainer, key=cost, default=best)
 
 
 def only_more(start: Model, best: Model, other: Model) -> bool:
-    """Return whether another has more effects or places than a model that leaves nothing.
+    """Return whether another has more units than a model that leaves nothing, for hardly more.
 
     What is left is as little as a law of a slightly other form leaves, and more strengths mend some
     of that whatever they are: a centre of mass that is shifted along two axes is more than a tilt.
@@ -58,7 +59,7 @@ def only_more(start: Model, best: Model, other: Model) -> bool:
     """
     explained, more = (float((m.deviances() - other.deviances()).sum()) for m in (start, best))
     several = len(other.units) > len(best.units) and nothing_left(start, best)
-    return several and more < _FORM * explained
+    return several and more < _SLIGHTLY * explained
 
 
 def leaves_less_to_do(best: Model, other: Model) -> bool:

@@ -73,6 +73,11 @@ class Model:
         """Return the effects that it has and ``base`` has not."""
         return [unit for unit in self.units if unit not in base.units]
 
+    def instead(self, base: Model) -> list[Unit]:
+        """Return what it has in the place of effects of ``base``, whose laws it may bend."""
+        beyond = self.beyond(base)
+        return [unit for unit in beyond if unit.name not in base.names] or beyond
+
     def deviances(self) -> Array:
         """Return misfits of all segments, training then validation."""
         return np.concatenate([(self.fit.innovations**2).sum(-1), (self.validation**2).sum(-1)])
@@ -115,7 +120,7 @@ def best_by_effect(models: Iterable[Model], base: Model) -> dict[str, Model]:
     """Return the best model by the first effect that it has beyond a base, the best first."""
     best: dict[str, Model] = {}
     for model in sorted(models, key=lambda m: criterion(m, 1.0)):
-        best.setdefault(model.beyond(base)[0].name, model)
+        best.setdefault(model.instead(base)[0].name, model)
     return best
 
 

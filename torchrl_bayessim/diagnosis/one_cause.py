@@ -85,8 +85,8 @@ def lateness(model: Model, robot: Robot) -> dict[str, str]:
     """Return the delay that is told with a filter, or the other way round, and that other's name.
 
     What several filters in a row do is nearly one filter and dead time (Skogestad 2003, the half
-    rule): one cause, where both are at the same actuators or sensors. It has the name of what makes
-    it later, of equal ones the filter's.
+    rule): one cause, where one of the two is at all actuators or sensors of the other. The one at
+    more of them gives the name; at the same ones what makes those later, of equals the filter.
 
     Args:
         model: With the effects that were found.
@@ -96,7 +96,9 @@ def lateness(model: Model, robot: Robot) -> dict[str, str]:
     for names in _LATE:
         if set(names) <= set(model.names):
             found = {name: _by_target(model, name, robot) for name in names}
-            first, second = sorted(names, key=lambda name: -sum(found[name].values()))
+            first, second = sorted(
+                names, key=lambda name: (-len(found[name]), -sum(found[name].values()))
+            )
             if found[second].keys() <= found[first].keys():
                 told[second] = first
     return told

@@ -73,6 +73,7 @@ class Search:
         units: The effects, those of the model that was found in the forms that fit.
         screens: One per round.
         p_values: Of the largest likelihood ratio of each round.
+        screened: Names of the effects beside which the last of them was found.
         tried: Every model that was fitted.
     """
 
@@ -96,6 +97,7 @@ class Search:
         self.worth = partial(beside_variation, start) if varied else _worth(start, train)
         self.units: Sequence[Unit] = offered
         self.tried, self.screens, self.p_values = [start], list[Screen](), list[float]()
+        self.screened = frozenset[str]()
 
     def best(self, base: Model | None = None) -> Model:
         """Return what the data need: what is found beside less than a round had counts too.
@@ -163,6 +165,7 @@ class Search:
         now = compare(train, best.fit, left)
         self.screens.append(now.seen)
         self.p_values.append(_p_value(now.seen, best, self.generator))
+        self.screened = frozenset(best.names)
         if self.again is not None and not best.units and len(self.screens) == 1:
             models = self.again()
             self.tried = [self.start, *models]

@@ -43,6 +43,7 @@ class Selection:
         tried: Every model that was fitted.
         alternatives: For each effect of the best model, the models with another in its place.
         offered: The units that were considered, with effects as they were offered.
+        screened: Names of the effects beside which the last p-value was found.
     """
 
     nominal: Model
@@ -52,6 +53,16 @@ class Selection:
     tried: tuple[Model, ...]
     alternatives: dict[str, tuple[Model, ...]]
     offered: tuple[Unit, ...] = ()
+    screened: frozenset[str] = frozenset()
+
+    @property
+    def missing(self) -> float:
+        """How often noise alone would let so much be missing beside the best model, 1 if unknown.
+
+        Effects that were exchanged, dropped or added since were not screened beside.
+        """
+        same = bool(self.p_values) and self.screened == self.best.names
+        return self.p_values[-1] if same else 1.0
 
     def seen_as(self, before: Selection) -> Selection:
         """Return it with what was seen of every effect before, where noise alone was noise."""
@@ -122,7 +133,7 @@ def select(
     if two is not best:
         best, others = _settled(search, search.best(two))
     found = tuple(search.screens), tuple(search.p_values), tuple(search.tried), others
-    return Selection(start, best, *found, offered=tuple(units))
+    return Selection(start, best, *found, offered=tuple(units), screened=search.screened)
 
 
 def _anew(train: Objective, validation: Objective, known: Selection) -> list[Model]:

@@ -5,8 +5,8 @@ how much of it the effects explain, not only whether it is significant::
 
     none           nothing significant, or an excess below 5 % of the noise floor
     named          effects explain at least 80 %, surely 40 % and of other motions some, and what is
-                   left is not significant, there or to the search (p < 1e-4), or 2 % and no more
-                   than the noise, of several effects a fifth of it
+                   left is not significant, there or to the search (p < 1e-4) where test runs say
+                   little, or 2 % and no more than the noise, of several effects a fifth of it
     named_partial  effects explain at least 40 %; the rest is located. Or 80 % on validation runs,
                    where test runs hardly show the gap. Or perhaps 40 %, of a cause that is certain
                    and surely helps on test runs, and leaves less than the noise once more. Or of a
@@ -53,7 +53,8 @@ from .validation import (
 _UNEXPLAINED = 1.5  # mean squared innovation of every split, to speak of an unknown cause
 _PLAIN = 4.0  # the same, to need no interval: few segments have a wide one, as about impacts
 _CERTAIN = 1e-15  # p-value of a gap that is too small to be seen at a glance
-_DOUBTLESS = 1e-4  # the same, where all runs of the search together show an effect, or another
+_DOUBTLESS = 1e-4  # the same, where all runs of the search together show an effect
+_MISSING = 1e-4  # the same, of what is left beside the effects
 _MOST = 0.5  # of the joints without measured velocity
 _NOISE_AGAIN = 2.0  # mean squared innovation: as much again as the noise
 _ALL = 0.98
@@ -155,7 +156,7 @@ class _Weighed:
         together: Whether all other runs together show it, of a gap that is hardly above noise, or
             those of the fit surely do, and all of it, or it is chance and certain.
         several: Whether several effects were found.
-        remains: Whether the search is sure that something else is missing.
+        remains: Whether the search is sure that something else is missing, that lasts.
     """
 
     measured: Shrinkage
@@ -215,7 +216,7 @@ class _Weighed:
         several = len(effects) > 1 or len(selection.best.names) > 1
         return cls(
             measured, significant, certain, visible, validated, unsaid, elsewhere, helps, together,
-            several, remains=len(selection.p_values) > 1 and selection.p_values[-1] < _DOUBTLESS,
+            several, remains=selection.missing < _MISSING and not scattered,
         )  # fmt: skip
 
     def named(self, *, ambiguous: bool) -> Verdict:
@@ -235,8 +236,9 @@ class _Weighed:
         # laws together imitate many a third one nearly
         most = SHOWN if self.several else _NOISE_AGAIN
         nearly_all = measured.explained >= _ALL and measured.effects <= most
+        low, high = (1.0 + end for end in measured.remainder_ci)
         # few test segments say little of what is left; the runs of the search may be sure of it
-        left = 1.0 + measured.remainder_ci[0] > NEGLIGIBLE or self.remains
+        left = low > NEGLIGIBLE or (self.remains and high > NEGLIGIBLE)
         left &= not nearly_all
         borne_out = measured.explained >= NAMED and measured.explained_ci[0] >= PARTIAL
         # what may explain nothing of other motions is no cause that is known

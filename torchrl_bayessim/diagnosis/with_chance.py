@@ -54,7 +54,7 @@ def with_chance(
         units: Effects at their targets, those of chance among them.
         holds: Channels whose samples were not always renewed.
         alarms: From before that search.
-        search: Searchinges for effects that last.
+        search: Searches for effects that last.
         generator: Of simulated noise.
     """
     random, suspects = of_chance(units), Suspects.of(prepared, selection, units)
