@@ -277,6 +277,7 @@ def test_more_places_have_to_explain_a_share_where_one_leaves_nothing(
     found = Selection(start, tilt, (), (), (start, tilt, shift), {"gravity_tilt": (shift,)})
     assert only_more(start, tilt, shift) is not bool(front)
     assert exchanged(start, tilt, found.alternatives) is (tilt, shift)[front]
+    assert exchanged(start, shift, {"com_shift": (tilt,)}) is (tilt, shift)[front]
     assert (
         settled(found, "gravity_tilt", dict.fromkeys(("train", "validation"))).best
         is (tilt, shift)[front]
@@ -285,6 +286,6 @@ def test_more_places_have_to_explain_a_share_where_one_leaves_nothing(
 
 def test_where_much_is_left_more_places_may_explain_hardly_more():
     start = model(1001.0)
-    for left, more, alone in ((20.0, 19.5, False), (1.1, 0.6, True)):
+    for left, more, alone in ((20.0, 19.5, False), (9.0, 8.5, True), (1.1, 0.6, True)):
         one = model(left, "gravity_tilt")
         assert only_more(start, one, model(more, "gravity_tilt", "com_shift")) is alone

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 
 from .free_numbers import priced
-from .further_effects import nothing_left
+from .further_effects import leaves_little
 from .model import LIKELY, Model, as_good, gain, needed, numbers
 from .objective import Unit
 
@@ -25,7 +25,7 @@ def exchanged(
 ) -> Model:
     """Return the best of a model and its alternatives, itself unless chance is unlikely.
 
-    Of those with more units, where it leaves nothing, only what explains a share (`only_more`). Or
+    More units than in one that leaves little have to explain a share (`only_more`), in either. Or
     unless one that is as good leaves less for the others to do (`leaves_less_to_do`).
 
     Args:
@@ -46,19 +46,21 @@ def exchanged(
         return best  # something is wrong with both, and more strengths mend more of it
     if better_by > LIKELY:
         return first
-    plainer = [m for m in some if leaves_less_to_do(best, m)]
+    plainer = [
+        m for m in some if leaves_less_to_do(best, m) or only_more(start, other=best, best=m)
+    ]
     return min(plainer, key=cost, default=best)
 
 
 def only_more(start: Model, best: Model, other: Model) -> bool:
-    """Return whether another has more units than a model that leaves nothing, for hardly more.
+    """Return whether another has more units than a model that leaves little, for hardly more.
 
     What is left is as little as a law of a slightly other form leaves, and more strengths mend some
     of that whatever they are: a centre of mass that is shifted along two axes is more than a tilt.
     So they have to explain a share of all that is explained.
     """
     explained, more = (float((m.deviances() - other.deviances()).sum()) for m in (start, best))
-    several = len(other.units) > len(best.units) and nothing_left(start, best)
+    several = len(other.units) > len(best.units) and leaves_little(start, best)
     return several and more < _SLIGHTLY * explained
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 __all__ = [
     "beside_variation",
     "identified",
+    "leaves_little",
     "no_rival",
     "nothing_left",
     "numerical",
@@ -111,7 +112,7 @@ def _matters(
     if screened:
         sure |= gain(base, better) > _SURELY / 2 and total_gain(base, better) > 2 * _SURELY
     just_this = sure and removed > 1.0 - _NOTHING
-    if _leaves_less(start, base, _REMAINS):
+    if leaves_little(start, base):
         # a simulator that integrates otherwise is late, too, by a part of its time step
         second = len({unit.name for unit in base.units if _does_something(unit, better)}) <= 1
         second &= not _within_a_step(base, better, timestep)
@@ -256,7 +257,12 @@ def nothing_left(start: Model, best: Model) -> bool:
     """Return whether what is left is no share of the gap, or a small one no larger than noise."""
     if _leaves_less(start, best, _NUMERICAL):
         return True
-    return _leaves_less(start, best, _REMAINS) and best.mean_square < _VISIBLE
+    return leaves_little(start, best) and best.mean_square < _VISIBLE
+
+
+def leaves_little(start: Model, best: Model) -> bool:
+    """Return whether effects leave so small a share of the gap that it is hardly worth another."""
+    return _leaves_less(start, best, _REMAINS)
 
 
 def _leaves_less(start: Model, best: Model, share: float) -> bool:
