@@ -47,7 +47,7 @@ from .wavering import waver
 Array = NDArray[np.float64]
 _MOST = 4  # effects in one explanation
 _LESS, _FORMS = 0.05, 3  # of what is explained; models that explain all but that
-_MUCH = 5.0  # mean squared innovation: a law that is stuck where it began may leave as much
+_MUCH = 1.5  # mean squared innovation: a law with a corner may leave as much of a soft one
 _ROUGH, _BEGINNINGS = 2.0, 5  # mean squared innovation of what two may explain; others tried
 MANY = 150  # effects at their places, of which another round takes too long
 _UNSEEN = 1.0  # a deviance, in units of the dispersion, that no test can detect
