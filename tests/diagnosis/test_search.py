@@ -52,8 +52,10 @@ def test_nothing_is_searched_again_where_all_is_needed():
     assert search.asked == [(), (A,)]
 
 
-@pytest.mark.parametrize(("left", "led"), [(2400.0, True), (1600.0, False)])
-def test_where_much_is_left_a_limit_is_led_to_and_what_is_alike_too(monkeypatch, left, led):
+@pytest.mark.parametrize(("left", "led"), [(2400.0, True), (700.0, True), (500.0, False)])
+def test_where_more_than_noise_is_left_a_limit_is_led_to_and_what_is_alike_too(
+    monkeypatch, left, led
+):
     """A push was preferred to a bias before the limit, between which corners do not tell."""
     push, bias = (plain([A, other], left + i) for i, other in enumerate((C, WEAK)))
     others = [plain([A, C, WEAK], left - 100), plain([A], 5e5), bias, push]
