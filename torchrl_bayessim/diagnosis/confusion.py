@@ -134,7 +134,7 @@ def _another_form(selection: Selection, rival: Model, name: str, *, form: float)
     """Return whether a rival of the same group explains nearly all of the same."""
     best = selection.best
     mine = {kind(u.effect) for u in best.units if u.name == name}
-    others = {kind(u.effect) for u in rival.instead(selection.best)}
+    others = {kind(u.effect) for u in rival.instead(best)}
     groups = {u.effect.group for u in (*best.units, *rival.units) if kind(u.effect) in mine}
     least = form if len(groups) == 1 else max(form, _ELSEWHERE)
     return mine == others and _short(selection, rival) < least

@@ -112,15 +112,18 @@ def lateness_alarms(model: Model, told: Mapping[str, str], robot: Robot) -> list
         told: What is told with another; by :func:`lateness`, and other effects.
         robot: Where they act.
     """
-    return [
-        f"{place} is late by {filtered[place]:.3g} s of a filter and {delayed[place]:.3g} s of "
-        f"delay: in the simulator {plain(names[0])} and {plain(names[1])} stand for it together"
-        for names in _LATE
-        if told.get(names[0]) == names[1] or told.get(names[1]) == names[0]
-        for filtered, delayed in [[_by_target(model, name, robot) for name in names]]
-        for place in filtered
-        if place in delayed
-    ]
+    texts: list[str] = []
+    for lag, delay in _LATE:
+        if told.get(lag) != delay and told.get(delay) != lag:
+            continue
+        filtered, delayed = (_by_target(model, name, robot) for name in (lag, delay))
+        texts += [
+            f"{place} is late by {filtered[place]:.3g} s of a filter and {delayed[place]:.3g} s of "
+            f"delay: in the simulator {plain(lag)} and {plain(delay)} stand for it together"
+            for place in filtered
+            if place in delayed
+        ]
+    return texts
 
 
 def _measure(model: Model, robot: Robot) -> str:
