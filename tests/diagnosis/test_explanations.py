@@ -2,7 +2,7 @@
 
 from plain_models import A, B, C, plain
 
-from torchrl_bayessim.diagnosis.explanations import _fittest
+from torchrl_bayessim.diagnosis.explanations import _elsewhere, _fittest
 
 
 def fit(misfit, *units):
@@ -30,3 +30,11 @@ def test_the_same_effect_elsewhere_is_added_like_any_other():
     fits = [elsewhere, other, two]
     assert _fittest(fits, 2, alike=1) == [two, other, elsewhere]
     assert _fittest(fits, 2, there=[A], alike=1) == [other, elsewhere]
+
+
+def test_the_best_effect_at_another_place_goes_on_if_a_few_steps_hardly_tell():
+    at_all, at_one, next_one = fit(100.0, A), fit(140.0, B), fit(150.0, A, B)
+    far, other = fit(900.0, B), fit(90.0, C)
+    assert _elsewhere(at_all, [other, next_one, at_one, at_all]) == [at_one]
+    assert _elsewhere(at_all, [fit(110.0, A), far, other]) == []
+    assert _elsewhere(other, [at_all, at_one, other]) == []

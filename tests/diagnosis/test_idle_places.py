@@ -138,3 +138,22 @@ def test_a_faint_effect_is_kept_where_next_to_nothing_is_left_with_it(left, kept
     predictor = SimpleNamespace(system=SimpleNamespace(robot="robot"))
     kept_of = worthwhile(selection, {"train": SimpleNamespace(predictor=predictor)}).best
     assert kept_of.names == kept
+
+
+@pytest.mark.parametrize(("credit", "lasting", "kept"), [
+    (0.02, 1.0, {"gain", "friction"}),
+    (0.02, 0.5, {"gain", "friction"}),
+    (0.02, 0.1, {"gain"}),
+    (1e-4, 1.0, {"gain", "friction"}),  # next to nothing, but surely one of two
+    (1e-4, 0.99, {"gain"}),
+])  # fmt: skip
+def test_beside_chance_an_effect_is_a_third_cause_and_its_credit_a_part_of_all(
+    credit, lasting, kept
+):
+    knee = Unit("friction", "knee")
+    start, best, gap = plain([], 400.0 + 150.0 / credit), plain([A, knee], 400.0), 150.0
+    tried = (start, plain([A], 400.0 + gap), plain([knee], 400.0 + gap / credit))
+    selection = Selection(start, best, (), (0.5,), tried, {"friction": ()})
+    predictor = SimpleNamespace(system=SimpleNamespace(robot="robot"))
+    sets = {"train": SimpleNamespace(predictor=predictor)}
+    assert worthwhile(selection, sets, lasting=lasting).best.names == kept

@@ -54,13 +54,38 @@ FREE = of_segments(touching=None)
 def test_little_is_left_if_it_is_hardly_more_than_noise_and_surely_more(
     units, left, p_value, little
 ):
-    assert little_left(plain(units, left), p_value, FREE) == little
+    assert little_left(plain(units, left), p_value) == little
 
 
-def test_what_touches_the_ground_leaves_more_than_noise_anyway():
-    model = plain([A], 440.0)
-    assert little_left(model, 1e-8, FREE)
-    assert not little_left(model, 1e-8, of_segments(touching=np.ones((4, 9), dtype=bool)))
+@pytest.mark.parametrize(
+    ("touching", "gained", "beside", "whole"),
+    [
+        (False, 30.0, 0.0, True),
+        (False, 90.0, 8.0, False),  # something is missing still
+        (False, 200.0, 19.0, True),
+        (True, 30.0, 0.0, False),
+        (True, 200.0, 0.0, True),
+        (True, 200.0, 19.0, True),
+        (True, 200.0, 21.0, False),
+    ],
+)
+def test_one_effect_is_all_of_little_if_it_explains_ten_times_what_shows_beside_it(
+    monkeypatch, *, touching, gained, beside, whole
+):
+    known, added = (units_of([effect(n)], system().robot)[0] for n in ("armature", "payload"))
+    start, best = plain([], 9000.0), plain([known], 400.0 + gained)
+    better = plain([known, added], 400.0)
+    seen = SimpleNamespace(ratios=lambda _: np.array([beside]))
+    ours = "torchrl_bayessim.diagnosis.little_left."
+    monkeypatch.setattr(ours + "compare", lambda *_: SimpleNamespace(seen=seen))
+    monkeypatch.setattr(ours + "waver", lambda *_: False)
+    monkeypatch.setattr(ours + "numerical", lambda *_: False)
+    train = of_segments(touching=np.ones((4, 9), dtype=bool) if touching else None)
+    train.predictor = SimpleNamespace(system=system())
+    found = all_of_little(
+        start, best, [better], train=train, left=[], missing=lambda seen, _: beside > 0
+    )
+    assert found is (better if whole else None)
 
 
 @pytest.mark.parametrize(("rest", "alone"), [(0.0, True), (12.0, False)])

@@ -75,7 +75,7 @@ def assemble(
         begun: When the diagnosis began, by ``time.perf_counter``.
         alpha: Level of the tests.
     """
-    selection = worthwhile(selection, prepared.sets)
+    selection = worthwhile(selection, prepared.sets, lasting=scatter.lasting(prepared, selection))
     credit = credit_of(selection)
     for name in sorted(credit, key=lambda name: -credit[name]):
         if name in selection.best.names:

@@ -23,24 +23,31 @@ _OFF = 0.01  # p-value of what is left, below which a model is off somewhere
 _MORE = 1.5  # times what is left with it, without
 
 
-def worthwhile(selection: Selection, sets: Mapping[str, Objective]) -> Selection:
+def worthwhile(
+    selection: Selection, sets: Mapping[str, Objective], *, lasting: float = 1.0
+) -> Selection:
     """Return the selection, apart, without effects that have next to no credit.
 
     In a model that is a little off everywhere a further effect mends some of it, surely but for
     nothing; unless it is what no law at the places of the others could be.
+
+    Args:
+        selection: What was found.
+        sets: Segments by split.
+        lasting: Their share of the gap together; the rest is due to chance, a cause of its own.
     """
     while True:
         selection = _apart(selection, sets)
         credit = credit_of(selection)
         least = min(credit, key=credit.__getitem__, default="")
-        if len(credit) < 2 or credit[least] >= _LEAST:
+        if len(credit) < 2 or lasting * credit[least] >= _LEAST:
             return selection
         kept = {unit for unit in selection.best.units if unit.name != least}
         without = [model for model in selection.tried if set(model.units) == kept]
         best = min(without, key=lambda model: float(model.deviances().sum()))
         if best.deviances().sum() > _MORE * selection.best.deviances().sum():
             return selection  # little of the gap, but most of what is left of it
-        if _surely_needed(best, selection):
+        if lasting == 1.0 and _surely_needed(best, selection):
             return selection
         if surely_elsewhere(best, selection.best, sets["train"].predictor.system.robot):
             return selection

@@ -20,7 +20,7 @@ from ..effects.effect import Effect
 from ..effects.robot import Robot
 from .additions import groups, one_for_all, pairs, singles
 from .objective import Objective, Point, Unit, units_of
-from .refit import Fit, refit
+from .refit import Fit, outrun, refit
 from .screening import Screen, screen
 
 _PROMISING = 24  # explanations that are fitted on some segments
@@ -102,6 +102,7 @@ def explanations(train: Objective, now: Round) -> list[Fit]:
     tried += refit(now.thin, everywhere, iterations=3, renew=False)
     if _plain(base.take(now.index)):
         best = _fittest(tried, _FINALISTS, there=base.units, alike=1)
+        best += _elsewhere(best[0], tried)
         return refit(train, [fit.point for fit in best], race=np.inf)
     starts = [fit.point for fit in _fittest(tried, _SURVIVORS, there=base.units)]
     known: list[Fit | None] = []
@@ -241,6 +242,17 @@ def _apart(fits: Sequence[Fit], most: int, alike: int) -> list[Fit]:
         if len(kept) < most and same < alike and all(set(fit.units) != set(f.units) for f in kept):
             kept.append(fit)
     return kept
+
+
+def _elsewhere(best: Fit, tried: Sequence[Fit]) -> list[Fit]:
+    """Return the best fit of the same effects at other places, if a few segments hardly tell.
+
+    After a few steps all drives at once may be as good there as the one that it is.
+    """
+    others = [fit for fit in tried if _names(fit) == _names(best)]
+    others = [fit for fit in others if set(fit.units) != set(best.units)]
+    first = min(others, key=lambda fit: _priced(fit, fit.misfit), default=best)
+    return [] if first is best or outrun(first.cost, 0.0, best.cost) else [first]
 
 
 def _names(fit: Fit) -> frozenset[str]:

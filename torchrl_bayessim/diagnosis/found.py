@@ -162,7 +162,7 @@ def _is_stopgap(bridged: Shrinkage, gap: float) -> bool:
 def _with_arrivals(found: Found, scatter: Scatter, sent: Sent, robot: Robot) -> Found:
     """Return the same with commands that were lost or late, of the gap with those sent."""
     measured = scatter.with_arrivals(found.measured, sent)
-    others = (1.0 - sent.share(found.measured)) * measured.explained
+    others = (1.0 - sent.share(found.measured.refit, found.measured.effects)) * measured.explained
     total = max(sum(effect.share_of_gap for effect in found.effects), 1e-9)
     lasting = [replace(e, share_of_gap=others * e.share_of_gap / total) for e in found.effects]
     (lost,) = scatter.findings(measured, robot, others=others)

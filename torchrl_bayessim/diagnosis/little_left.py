@@ -30,24 +30,22 @@ _SURELY = 1e-4  # p-value of what is left, to look for one effect that is all of
 _PLAIN = 25.0  # deviance that it removes, which chance hardly makes of any of a hundred units
 _DRAWS, _RARELY = 1000, 0.99  # of noise, and where the largest ratio of so many of them lies
 _MORE = 2.0  # times that: what a fit may explain and a screen does not
+_SURE, _TENTH = 100.0, 0.1  # the same where feet touch or something is missing still: so little
 _FORMS = CoulombFriction.group, Backlash.group
 _LATE = ActionDelay.group, Backlash.group  # of each other, and of what a drive that gives way does
 _SMOOTH = ViscousFriction, PowerLawFriction, QuadraticDrag, ParallelSpring
 
 
-def little_left(best: Model, p_value: float, train: Objective) -> bool:
+def little_left(best: Model, p_value: float) -> bool:
     """Return whether a model of one effect leaves little more than noise, but surely more.
 
     Of one, since a third effect mends the forms of two others more easily. Not beside dry
-    friction, a drive that gives way or contacts, which no time step follows exactly.
+    friction or a drive that gives way, which no time step follows exactly.
 
     Args:
         best: With the effects that were found.
         p_value: Of what it leaves.
-        train: The segments of the fit.
     """
-    if train.segments.touching is not None:
-        return False
     if len(best.names) != 1 or best.mean_square > WHITE or p_value > _SURELY:
         return False
     return not any(
@@ -81,7 +79,8 @@ def all_of_little(
     """Return the model with the one effect that is all of the little that is left, if one is.
 
     Not of what is late beside what is late: delays, filters and springs in a drive are forms of
-    each other.
+    each other. Among contacts, which no time step follows exactly, it has to explain more. What
+    explains that, and ten times what shows beside it, may leave something.
 
     Args:
         start: Parameters alone.
@@ -98,12 +97,16 @@ def all_of_little(
     if better is None:
         return None
     timestep = float(train.predictor.system.task.model.opt.timestep)
-    if total_gain(best, better) < _PLAIN or numerical(start, best, better, timestep):
+    gained, touching = total_gain(best, better), train.segments.touching is not None
+    if gained < (_SURE if touching else _PLAIN) or numerical(start, best, better, timestep):
         return None
     others = [unit for unit in left if unit.name not in better.names]
     if not no_rival(best, better, single) or waver(best, better, train.segments):
         return None
-    return None if missing(compare(train, better.fit, others).seen, better) else better
+    seen = compare(train, better.fit, others).seen
+    largest = seen.ratios(max(1.0, better.fit.mean_square)).max(initial=0.0)
+    most = gained > _SURE and largest < _TENTH * gained
+    return better if most or not missing(seen, better) else None
 
 
 def _late(unit: Unit) -> bool:

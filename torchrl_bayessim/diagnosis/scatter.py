@@ -127,22 +127,22 @@ class Sent:
         rows = sum(len(one) for one, _ in logs)
         return cls(raw, refit, effects, lost, rows, samples=not counts[0])
 
-    def share(self, arrived: Shrinkage) -> float:
+    def share(self, refit: float, effects: float) -> float:
         """Return the share of the gap that losses have of what they and the effects remove.
 
         The mean over which of the two comes first (Shapley 1953), at least nothing in either order.
 
         Args:
-            arrived: How far the gap of the commands that arrived shrinks with the effects.
+            refit: The same of the commands that arrived, with fitted parameters.
+            effects: And with the effects.
 
         Example:
-            >>> sent = Sent(raw=9.0, refit=5.0, effects=3.0, lost=4, of=100)
-            >>> sent.share(Shrinkage(7.0, 3.0, 1.0, 1.0, (1.0, 1.0), (2.0, 2.0), (0.0, 0.0)))
+            >>> Sent(raw=9.0, refit=5.0, effects=3.0, lost=4, of=100).share(3.0, 1.0)
             0.5
         """
-        alone = max(self.refit - arrived.refit, 0.0)
-        beside = max(self.effects - arrived.effects, 0.0)
-        return min(0.5 * (alone + beside) / max(self.refit - arrived.effects, 1e-9), 1.0)
+        alone = max(self.refit - refit, 0.0)
+        beside = max(self.effects - effects, 0.0)
+        return min(0.5 * (alone + beside) / max(self.refit - effects, 1e-9), 1.0)
 
     @property
     def note(self) -> str:
@@ -193,6 +193,19 @@ class Scatter:
     def groups(self) -> set[str]:
         """The groups of what was found in the place of other effects."""
         return set() if self.beside else {chance.unit.effect.group for chance in self.found}
+
+    def lasting(self, prepared: Prepared, selection: Selection) -> float:
+        """Return the share of the gap that effects that last have, beside commands that were lost.
+
+        Args:
+            prepared: Logs with the commands that arrived.
+            selection: What was found on them.
+        """
+        if self.sent is None:
+            return 1.0
+        points = [selection.nominal.fit.point, selection.best.fit.point]
+        left = (prepared.sets["test"](points) ** 2).mean((1, 2)).tolist()
+        return 1.0 - self.sent.share(*left)
 
     def measured(self, before: Shrinkage, generator: np.random.Generator) -> Shrinkage:
         """Return how far the gap shrinks with the likeliest, standardised by its own scatter."""

@@ -207,7 +207,7 @@ class Search:
     def _little(self, best: Model, seen: Screen) -> bool:
         """Return whether little is left, and one effect may be all of it."""
         dispersion = max(1.0, best.fit.mean_square)
-        little = little_left(best, self.p_values[-1], self.sets[0])
+        little = little_left(best, self.p_values[-1])
         return little and one_alone(seen, dispersion, self.generator)
 
     def _explained(
