@@ -139,7 +139,7 @@ class _PowerLaw(ForceEffect):
 
 
 class QuadraticDrag(_PowerLaw):
-    """Drag ``−s v |v|ᵖ⁻¹``, ``p = 2``, as a damping; N m s²/rad², up to 30 % of ``F_max/v_max²``.
+    """Drag ``−s v |v|ᵖ⁻¹``, ``p = 2``, as a damping; N m s²/rad², up to ``F_max / v_max²``.
 
     Args:
         power: ``p``; a diagnosis fits it.
@@ -159,8 +159,8 @@ class QuadraticDrag(_PowerLaw):
         return {"power": (0.02, 1.5, 3.0)}
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
-        """Return 0 and 0.3 ``F_max / v_max²``."""
-        return within(robot.force_scale / robot.velocity_scale**2, 0.0, 0.3)
+        """Return 0 and ``F_max / v_max²``."""
+        return within(robot.force_scale / robot.velocity_scale**2, 0.0, 1.0)
 
 
 class PowerLawFriction(_PowerLaw):
