@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from plain_models import plain
-from test_diagnose import system
+from test_diagnose import logs, system
 
+from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.form_fit import _of_offered_kinds
 from torchrl_bayessim.diagnosis.free_numbers import fitted_numbers
 from torchrl_bayessim.diagnosis.objective import Point, units_of
@@ -71,3 +72,15 @@ def test_a_power_that_was_fitted_counts_as_a_number():
     """A law of the same name was offered, with no such number."""
     assert fitted_numbers(plain({POWER: 0.1}, 1000.0), [STRAIGHT]) == 2
     assert fitted_numbers(plain({POWER: 0.1}, 1000.0), [DRAG]) == 1
+
+
+def test_drag_that_takes_all_of_a_motor_at_the_largest_speed_is_told_alone_and_as_strong():
+    """In a narrower range other effects would make up for what it may not be."""
+    largest, fastest = ROBOT.force_scale[0].item(), ROBOT.velocity_scale[0].item()
+    strong = largest / fastest**2
+    assert DRAG.high == pytest.approx(strong)
+    names = ["quadratic_drag", "viscous_friction", "parallel_spring", "time_scale", "action_gain"]
+    data = logs(push=lambda _, v: -strong * v * abs(v))
+    (drag,) = diagnose(system(), None, data, effects=names).effects
+    assert drag.name == "quadratic_drag"
+    assert drag.strength == pytest.approx(strong, rel=0.03)
