@@ -1,8 +1,9 @@
 """Which fits the search goes on with."""
 
+import pytest
 from plain_models import A, B, C, plain
 
-from torchrl_bayessim.diagnosis.explanations import _elsewhere, _fittest
+from torchrl_bayessim.diagnosis.explanations import _at_other_places, _fittest
 
 
 def fit(misfit, *units):
@@ -32,9 +33,39 @@ def test_the_same_effect_elsewhere_is_added_like_any_other():
     assert _fittest(fits, 2, there=[A], alike=1) == [other, elsewhere]
 
 
-def test_the_best_effect_at_another_place_goes_on_if_a_few_steps_hardly_tell():
-    at_all, at_one, next_one = fit(100.0, A), fit(140.0, B), fit(150.0, A, B)
-    far, other = fit(900.0, B), fit(90.0, C)
-    assert _elsewhere(at_all, [other, next_one, at_one, at_all]) == [at_one]
-    assert _elsewhere(at_all, [fit(110.0, A), far, other]) == []
-    assert _elsewhere(other, [at_all, at_one, other]) == []
+@pytest.mark.parametrize(
+    ("best", "tried", "goes_on"),
+    [
+        ([(100.0, A)], [(90.0, C), (150.0, A, B), (140.0, B)], (140.0, B)),
+        ([(100.0, A)], [(138.0, A, B), (140.0, B)], (140.0, B)),  # of two strengths
+        ([(100.0, A)], [(120.0, A, B), (140.0, B)], (120.0, A, B)),
+        ([(100.0, A)], [(249.0, B)], (249.0, B)),
+        ([(100.0, A)], [(251.0, B)], None),
+        ([(100.0, A)], [(110.0, A), (90.0, C)], None),
+        ([(100.0, A, B)], [(110.0, B, A), (900.0, C)], None),
+        ([(100.0, A, B), (120.0, A)], [(120.0, A), (140.0, B)], (140.0, B)),
+        ([(90.0, C), (100.0, A)], [(110.0, B)], None),
+    ],
+    ids=[
+        "other places",
+        "fewer",
+        "surely more",
+        "as good",
+        "worse",
+        "the same",
+        "the same, turned",
+        "one of them goes on",
+        "not the best",
+    ],
+)
+def test_the_best_effect_at_other_places_goes_on_if_a_few_segments_hardly_tell(
+    best, tried, goes_on
+):
+    tried = {one: fit(*one) for one in tried}
+    found = _at_other_places([fit(*one) for one in best], list(tried.values()))
+    assert found == ([] if goes_on is None else [tried[goes_on]])
+
+
+def test_what_the_prior_holds_against_a_place_counts():
+    at_one, far = fit(100.0, A), plain((B,), 150.0, z=8.0).fit
+    assert _at_other_places([at_one], [far]) == []

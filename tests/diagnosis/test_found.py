@@ -3,8 +3,8 @@
 import pytest
 from plain_models import Unit
 
+from torchrl_bayessim.diagnosis.as_recorded import Recorded
 from torchrl_bayessim.diagnosis.found import _is_stopgap, _together
-from torchrl_bayessim.diagnosis.scatter import Recorded
 from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
 
 HIP, KNEE, HARDER = Unit("friction", "hip"), Unit("friction", "knee"), Unit("friction", "hip", 2.0)

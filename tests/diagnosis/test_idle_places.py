@@ -141,11 +141,12 @@ def test_a_faint_effect_is_kept_where_next_to_nothing_is_left_with_it(left, kept
 
 
 @pytest.mark.parametrize(("credit", "lasting", "kept"), [
+    (0.02, None, {"gain", "friction"}),
     (0.02, 1.0, {"gain", "friction"}),
     (0.02, 0.5, {"gain", "friction"}),
     (0.02, 0.1, {"gain"}),
-    (1e-4, 1.0, {"gain", "friction"}),  # next to nothing, but surely one of two
-    (1e-4, 0.99, {"gain"}),
+    (1e-4, None, {"gain", "friction"}),  # next to nothing, but surely one of two
+    (1e-4, 1.0, {"gain"}),
 ])  # fmt: skip
 def test_beside_chance_an_effect_is_a_third_cause_and_its_credit_a_part_of_all(
     credit, lasting, kept

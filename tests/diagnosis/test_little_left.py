@@ -61,12 +61,15 @@ def test_little_is_left_if_it_is_hardly_more_than_noise_and_surely_more(
     ("touching", "gained", "beside", "whole"),
     [
         (False, 30.0, 0.0, True),
-        (False, 90.0, 8.0, False),  # something is missing still
-        (False, 200.0, 19.0, True),
+        (False, 90.0, 4.0, False),  # something is missing still
+        (False, 200.0, 9.0, True),
+        (False, 200.0, 11.0, False),
         (True, 30.0, 0.0, False),
         (True, 200.0, 0.0, True),
-        (True, 200.0, 19.0, True),
-        (True, 200.0, 21.0, False),
+        (True, 90.0, 0.0, False),
+        (True, 200.0, 9.0, True),
+        (True, 200.0, 11.0, False),
+        (False, 200.0, None, True),
     ],
 )
 def test_one_effect_is_all_of_little_if_it_explains_ten_times_what_shows_beside_it(
@@ -75,7 +78,8 @@ def test_one_effect_is_all_of_little_if_it_explains_ten_times_what_shows_beside_
     known, added = (units_of([effect(n)], system().robot)[0] for n in ("armature", "payload"))
     start, best = plain([], 9000.0), plain([known], 400.0 + gained)
     better = plain([known, added], 400.0)
-    seen = SimpleNamespace(ratios=lambda _: np.array([beside]))
+    left = np.array([] if beside is None else [beside / 4])  # half as many segments, twice as far
+    seen = SimpleNamespace(ratios={1.0: left}.__getitem__, growth=np.full(left.shape, 2.0))
     ours = "torchrl_bayessim.diagnosis.little_left."
     monkeypatch.setattr(ours + "compare", lambda *_: SimpleNamespace(seen=seen))
     monkeypatch.setattr(ours + "waver", lambda *_: False)
@@ -83,7 +87,7 @@ def test_one_effect_is_all_of_little_if_it_explains_ten_times_what_shows_beside_
     train = of_segments(touching=np.ones((4, 9), dtype=bool) if touching else None)
     train.predictor = SimpleNamespace(system=system())
     found = all_of_little(
-        start, best, [better], train=train, left=[], missing=lambda seen, _: beside > 0
+        start, best, [better], train=train, left=[], missing=lambda *_: bool(beside)
     )
     assert found is (better if whole else None)
 

@@ -14,6 +14,7 @@ from test_diagnose import logs, system
 from test_lost_values import TWO, run_of_two
 
 from torchrl_bayessim.diagnosis.arrivals import Arrivals
+from torchrl_bayessim.diagnosis.as_recorded import Recorded, Sent, along
 from torchrl_bayessim.diagnosis.beside_losses import Sought
 from torchrl_bayessim.diagnosis.chance import Chance
 from torchrl_bayessim.diagnosis.diagnose import diagnose
@@ -26,7 +27,7 @@ from torchrl_bayessim.diagnosis.lost_commands import _matters, _searched, beside
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.preparation import prepare
 from torchrl_bayessim.diagnosis.prepared_anew import with_other_logs
-from torchrl_bayessim.diagnosis.scatter import Sent, _along
+from torchrl_bayessim.diagnosis.scatter import Scatter
 from torchrl_bayessim.effects.action import PacketDrop
 from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.envs.task import Task
@@ -335,8 +336,19 @@ def test_the_gap_of_the_commands_that_were_sent_is_with_parameters_that_were_fit
     history, most = test.segments.history, len(test.segments)
     pieces = again.mode.cut(sent.logs["test"], again.horizon, history=history, most=most)
     points = [sent.nominal.point, again.nominal.point]
-    assert [told.refit, told.effects] == pytest.approx(_along(test, pieces, points).tolist())
+    assert [told.refit, told.effects] == pytest.approx(along(test, pieces, points).tolist())
     assert told.refit != pytest.approx(told.effects, rel=0.05)
+    other = Point(np.zeros_like(sent.nominal.point.z))
+    selection.best.fit = replace(again.nominal, point=other)
+    refit, effects = along(test, test.segments, [again.nominal.point, other])
+    told = replace(told, refit=4.0 * max(refit, effects), effects=2.0 * max(refit, effects))
+    chance = Chance(units[0], 0.3, 0.01, gain=900.0, left=np.full(3, 0.5))
+    for left, figures in ((None, (refit, effects)), (0.7 * refit, (0.7 * refit, 0.5))):
+        scatter = Scatter([replace(chance, alone=left)], {}, [], Recorded(), sent=told)
+        lasting = scatter.lasting(again, selection)
+        assert lasting == pytest.approx(1.0 - told.share(*figures))
+        assert 0.0 < lasting < 1.0
+    assert replace(scatter, sent=None).lasting(again, selection) is None
 
 
 def test_commands_lost_by_a_robot_whose_contacts_scramble_predictions_soon():

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..effects.action import ActionJitter
 from ..logs.log import Log
+from .as_recorded import Sent
 from .beside_losses import CERTAIN
 from .chance import CALM, Chance, calm
 from .jitter import Jitter, Responses, jitter, moments, shaken
@@ -30,7 +31,6 @@ from .moved_innovations import deviances_without, everywhere
 from .objective import Objective, Point, Unit
 from .preparation import Prepared
 from .prepared_anew import with_other_logs
-from .scatter import Sent
 from .searching import Searching
 from .selection import Selection
 from .varying import widened

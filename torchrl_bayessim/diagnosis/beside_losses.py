@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .as_recorded import Sent
 from .chance import Chance
 from .loss_suspects import Suspects
 from .preparation import Prepared
-from .scatter import Sent
 from .searching import Searching
 from .selection import Selection
 

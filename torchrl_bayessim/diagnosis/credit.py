@@ -24,7 +24,7 @@ _MORE = 1.5  # times what is left with it, without
 
 
 def worthwhile(
-    selection: Selection, sets: Mapping[str, Objective], *, lasting: float = 1.0
+    selection: Selection, sets: Mapping[str, Objective], *, lasting: float | None = None
 ) -> Selection:
     """Return the selection, apart, without effects that have next to no credit.
 
@@ -34,20 +34,22 @@ def worthwhile(
     Args:
         selection: What was found.
         sets: Segments by split.
-        lasting: Their share of the gap together; the rest is due to chance, a cause of its own.
+        lasting: Their share of the gap together, where the rest is due to commands or samples that
+            were lost or late: a cause of its own.
     """
+    share = 1.0 if lasting is None else lasting
     while True:
         selection = _apart(selection, sets)
         credit = credit_of(selection)
         least = min(credit, key=credit.__getitem__, default="")
-        if len(credit) < 2 or lasting * credit[least] >= _LEAST:
+        if len(credit) < 2 or share * credit[least] >= _LEAST:
             return selection
         kept = {unit for unit in selection.best.units if unit.name != least}
         without = [model for model in selection.tried if set(model.units) == kept]
         best = min(without, key=lambda model: float(model.deviances().sum()))
         if best.deviances().sum() > _MORE * selection.best.deviances().sum():
             return selection  # little of the gap, but most of what is left of it
-        if lasting == 1.0 and _surely_needed(best, selection):
+        if lasting is None and _surely_needed(best, selection):
             return selection
         if surely_elsewhere(best, selection.best, sets["train"].predictor.system.robot):
             return selection

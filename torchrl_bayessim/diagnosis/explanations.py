@@ -102,7 +102,7 @@ def explanations(train: Objective, now: Round) -> list[Fit]:
     tried += refit(now.thin, everywhere, iterations=3, renew=False)
     if _plain(base.take(now.index)):
         best = _fittest(tried, _FINALISTS, there=base.units, alike=1)
-        best += _elsewhere(best[0], tried)
+        best += _at_other_places(best, tried)
         return refit(train, [fit.point for fit in best], race=np.inf)
     starts = [fit.point for fit in _fittest(tried, _SURVIVORS, there=base.units)]
     known: list[Fit | None] = []
@@ -244,15 +244,22 @@ def _apart(fits: Sequence[Fit], most: int, alike: int) -> list[Fit]:
     return kept
 
 
-def _elsewhere(best: Fit, tried: Sequence[Fit]) -> list[Fit]:
-    """Return the best fit of the same effects at other places, if a few segments hardly tell.
+def _at_other_places(best: Sequence[Fit], tried: Sequence[Fit]) -> list[Fit]:
+    """Return the best fit of the first one's effects at other places, if segments hardly tell.
 
-    After a few steps all drives at once may be as good there as the one that it is.
+    After a few steps on some segments all drives at once may be as good as the one that it is.
+
+    Args:
+        best: Those that go on, the best first.
+        tried: All.
     """
-    others = [fit for fit in tried if _names(fit) == _names(best)]
-    others = [fit for fit in others if set(fit.units) != set(best.units)]
-    first = min(others, key=lambda fit: _priced(fit, fit.misfit), default=best)
-    return [] if first is best or outrun(first.cost, 0.0, best.cost) else [first]
+    known = [set(fit.units) for fit in best]
+    others = [fit for fit in tried if _names(fit) == _names(best[0])]
+    others = [fit for fit in others if set(fit.units) not in known]
+    if not others:
+        return []
+    first = min(others, key=lambda fit: _priced(fit, fit.misfit))
+    return [] if outrun(first.cost, 0.0, best[0].cost) else [first]
 
 
 def _names(fit: Fit) -> frozenset[str]:

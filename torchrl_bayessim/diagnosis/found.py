@@ -13,13 +13,14 @@ import numpy as np
 from ..effects.effect import Effect
 from ..effects.robot import Robot
 from ..effects.sensors import SensorDropout
+from .as_recorded import Sent
 from .candidates import strength_errors
 from .confusion import confusion_set
 from .model import gain, needed
 from .objective import Objective, Point, Unit, at_targets, strengths_of
 from .preparation import Prepared
 from .report import Finding
-from .scatter import Scatter, Sent
+from .scatter import Scatter
 from .selection import Selection
 from .shrinkage import Shrinkage, shrinkage
 from .validation import NEGLIGIBLE

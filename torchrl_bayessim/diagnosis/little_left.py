@@ -3,7 +3,8 @@
 A weak cause beside a strong one is a thousandth of the gap, and as much is left by the form of a
 law that is not quite the true one. But what is true explains the rest to the noise, with one
 strength, and no effect of another kind does; what mends the form of another law leaves something
-still, by the test that found that something is missing, or is one of several that mend as much.
+still, by the test that found that something is missing and more than a tenth of what it explains,
+or is one of several that mend as much.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ _SURELY = 1e-4  # p-value of what is left, to look for one effect that is all of
 _PLAIN = 25.0  # deviance that it removes, which chance hardly makes of any of a hundred units
 _DRAWS, _RARELY = 1000, 0.99  # of noise, and where the largest ratio of so many of them lies
 _MORE = 2.0  # times that: what a fit may explain and a screen does not
-_SURE, _TENTH = 100.0, 0.1  # the same where feet touch or something is missing still: so little
+_SURE = 100.0  # the same where contacts, or what is missing beside it, may imitate an effect
+_TENTH = 0.1  # of what it explains of the runs of the fit: what may be missing beside it
 _FORMS = CoulombFriction.group, Backlash.group
 _LATE = ActionDelay.group, Backlash.group  # of each other, and of what a drive that gives way does
 _SMOOTH = ViscousFriction, PowerLawFriction, QuadraticDrag, ParallelSpring
@@ -79,8 +81,8 @@ def all_of_little(
     """Return the model with the one effect that is all of the little that is left, if one is.
 
     Not of what is late beside what is late: delays, filters and springs in a drive are forms of
-    each other. Among contacts, which no time step follows exactly, it has to explain more. What
-    explains that, and ten times what shows beside it, may leave something.
+    each other. Where contacts correct what sensors say, and no time step follows them exactly, it
+    has to explain more. What explains that, and ten times what shows beside it, may leave that.
 
     Args:
         start: Parameters alone.
@@ -97,15 +99,17 @@ def all_of_little(
     if better is None:
         return None
     timestep = float(train.predictor.system.task.model.opt.timestep)
-    gained, touching = total_gain(best, better), train.segments.touching is not None
+    gained, fitted = total_gain(best, better), best.fit.misfit - better.fit.misfit
+    touching, dispersion = train.segments.touching is not None, max(1.0, better.fit.mean_square)
     if gained < (_SURE if touching else _PLAIN) or numerical(start, best, better, timestep):
         return None
     others = [unit for unit in left if unit.name not in better.names]
     if not no_rival(best, better, single) or waver(best, better, train.segments):
         return None
     seen = compare(train, better.fit, others).seen
-    largest = seen.ratios(max(1.0, better.fit.mean_square)).max(initial=0.0)
-    most = gained > _SURE and largest < _TENTH * gained
+    # a screen of some segments says as much less
+    largest = (seen.ratios(dispersion) * seen.growth**2).max(initial=0.0)
+    most = gained > _SURE and largest < _TENTH * fitted / dispersion
     return better if most or not missing(seen, better) else None
 
 

@@ -2,161 +2,27 @@
 
 from __future__ import annotations
 
-__all__ = ["Recorded", "Scatter", "Sent", "gap_with_holds"]
+__all__ = ["Scatter"]
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..effects.effect import Effect
 from ..effects.robot import Robot
 from ..effects.sensors import SensorDropout
-from ..logs.log import Log
+from .as_recorded import Recorded, Sent, along
 from .chance import Chance
-from .contacts import settled
 from .holds import Hold
-from .objective import Objective, Point, Unit, strengths_of, units_of
+from .objective import Point, Unit, strengths_of, units_of
 from .preparation import Prepared
 from .report import Candidate, Finding
-from .segments import Segments
 from .selection import Selection
 from .shrinkage import Shrinkage
-from .splits import split
-from .validation import NEGLIGIBLE
 
 _DRAWS = 1000
-_MOST = 0.5  # of what effects leave
-
-
-class Recorded(NamedTuple):
-    """Mean squared innovations of test segments, samples that were held among them.
-
-    Attributes:
-        refit: As they were recorded, without effects.
-        effects: With those that last.
-        bridged: The same with other samples in the place of those that were held.
-    """
-
-    refit: float = 1.0
-    effects: float = 1.0
-    bridged: float = 1.0
-
-    @property
-    def matter(self) -> bool:
-        """Whether held samples are most of what effects leave, and that is more than noise."""
-        left = self.effects - 1.0
-        return left > NEGLIGIBLE - 1.0 and self.effects - self.bridged > _MOST * left
-
-
-def gap_with_holds(prepared: Prepared, logs: Sequence[Log], selection: Selection) -> Recorded:
-    """Return what is left of test segments cut from the logs as recorded, and as bridged."""
-    test = prepared.sets["test"]
-    if test.segments.uncertainty is not None:  # the held samples entered the estimates too
-        return Recorded()
-    whole, size = split(logs)["test"], len(test.segments)
-    if test.segments.touching is not None:
-        theta = test.theta(selection.nominal.fit.point.z)
-        whole = settled(prepared.predictor, whole, theta=theta, noise=prepared.noise)
-    pieces = prepared.mode.cut(whole, prepared.horizon, history=test.segments.history, most=size)
-    if len(pieces) != size:
-        return Recorded()
-    points = [selection.nominal.fit.point, selection.best.fit.point]
-    return Recorded(*_along(test, pieces, points), *_along(test, test.segments, points[1:]))
-
-
-def _along(test: Objective, pieces: Segments, points: Sequence[Point]) -> NDArray[np.float64]:
-    """Return mean squared innovations of points on other segments of the same runs, ``(P,)``."""
-    left = test.along(pieces)(points)
-    total = np.asarray((left**2).sum((1, 2)), dtype=np.float64)
-    return total / (test.whitening.weights**2).sum() / left.shape[2]
-
-
-@dataclass(frozen=True)
-class Sent:
-    """Mean squared innovations of test segments with the commands that were sent.
-
-    Where others are taken to have acted, on which everything else is compared; or of samples as
-    they were recorded, where those that were lost are interpolated.
-
-    Attributes:
-        raw: At the prior's mean.
-        refit: With parameters that were fitted to these.
-        effects: With the effects that last, and parameters that were fitted beside them.
-        lost: How many commands, or samples, of all runs are taken to have been others.
-        of: How many there are.
-        samples: Whether they are samples.
-    """
-
-    raw: float
-    refit: float
-    effects: float
-    lost: int
-    of: int
-    samples: bool = False
-
-    @classmethod
-    def along(cls, prepared: Prepared, sent: Prepared, selection: Selection) -> Sent:
-        """Return them for what was found on the commands that arrived.
-
-        Args:
-            prepared: With these.
-            sent: The same runs with those that were sent.
-            selection: What was found.
-        """
-        test, nominal = prepared.sets["test"], sent.nominal.point
-        size, history = len(test.segments), test.segments.history
-        pieces = prepared.mode.cut(sent.logs["test"], prepared.horizon, history=history, most=size)
-        points = [Point(np.zeros_like(nominal.z)), nominal, selection.best.fit.point]
-        logs = [
-            pair
-            for name, part in sent.logs.items()
-            for pair in zip(part, prepared.logs[name], strict=True)
-        ]
-        counts = [
-            sum(
-                int((getattr(one, name) != getattr(other, name)).any(1).sum())
-                for one, other in logs
-            )
-            for name in ("ctrl", "qpos", "qvel")  # a velocity may be estimated from positions
-        ]
-        lost = next((count for count in counts if count), 0)
-        raw, refit, effects = _along(test, pieces, points).tolist()
-        rows = sum(len(one) for one, _ in logs)
-        return cls(raw, refit, effects, lost, rows, samples=not counts[0])
-
-    def share(self, refit: float, effects: float) -> float:
-        """Return the share of the gap that losses have of what they and the effects remove.
-
-        The mean over which of the two comes first (Shapley 1953), at least nothing in either order.
-
-        Args:
-            refit: The same of the commands that arrived, with fitted parameters.
-            effects: And with the effects.
-
-        Example:
-            >>> Sent(raw=9.0, refit=5.0, effects=3.0, lost=4, of=100).share(3.0, 1.0)
-            0.5
-        """
-        alone = max(self.refit - refit, 0.0)
-        beside = max(self.effects - effects, 0.0)
-        return min(0.5 * (alone + beside) / max(self.refit - effects, 1e-9), 1.0)
-
-    @property
-    def note(self) -> str:
-        """What the reader must know."""
-        if self.samples:
-            return (
-                f"{self.lost} of {self.of} samples are taken to have been lost, and interpolated; "
-                "the gap without causes is of the logs as recorded, all else, of test runs too, "
-                "of those with the interpolated"
-            )
-        return (
-            f"{self.lost} of {self.of} commands are taken to have been lost; the gap without "
-            "causes is of those that were sent, all else, of test runs too, of those that arrived"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,18 +60,25 @@ class Scatter:
         """The groups of what was found in the place of other effects."""
         return set() if self.beside else {chance.unit.effect.group for chance in self.found}
 
-    def lasting(self, prepared: Prepared, selection: Selection) -> float:
-        """Return the share of the gap that effects that last have, beside commands that were lost.
+    def lasting(self, prepared: Prepared, selection: Selection) -> float | None:
+        """Return the share of the gap that effects that last have beside what was lost or late.
+
+        Of the same figures as the report's. None where logs are compared as they are, which says
+        nothing of chance beside the effects.
 
         Args:
-            prepared: Logs with the commands that arrived.
+            prepared: Logs with commands, or samples, in the place of those that were lost.
             selection: What was found on them.
         """
         if self.sent is None:
-            return 1.0
+            return None
+        test = prepared.sets["test"]
         points = [selection.nominal.fit.point, selection.best.fit.point]
-        left = (prepared.sets["test"](points) ** 2).mean((1, 2)).tolist()
-        return 1.0 - self.sent.share(*left)
+        refit, effects = along(test, test.segments, points).tolist()
+        first = self.found[0]
+        if first.alone is not None:  # commands come late by times that vary, and that is noise here
+            refit, effects = min(first.alone, refit), min(float(first.left.mean()), effects)
+        return 1.0 - self.sent.share(refit, effects)
 
     def measured(self, before: Shrinkage, generator: np.random.Generator) -> Shrinkage:
         """Return how far the gap shrinks with the likeliest, standardised by its own scatter."""

@@ -12,6 +12,7 @@ import numpy as np
 from ..effects.action import PacketDrop
 from ..effects.sensors import SensorDropout
 from ..logs.log import Log
+from .as_recorded import Recorded, Sent, gap_with_holds
 from .beside_jitter import beside_jitter, outdone
 from .beside_losses import Sought
 from .chance import Chance, chances, detectable, of_chance, unseen
@@ -23,7 +24,7 @@ from .lost_samples import beside_lost_samples
 from .model import WHITE, Model, judged_fits, shown, takes_most
 from .objective import Unit
 from .preparation import Prepared
-from .scatter import Recorded, Scatter, Sent, gap_with_holds
+from .scatter import Scatter
 from .search import MANY
 from .searching import Searching
 from .selection import Selection
