@@ -45,6 +45,7 @@ def test_the_same_effect_elsewhere_is_added_like_any_other():
         ([(100.0, A, B)], [(110.0, B, A), (900.0, C)], None),
         ([(100.0, A, B), (120.0, A)], [(120.0, A), (140.0, B)], (140.0, B)),
         ([(90.0, C), (100.0, A)], [(110.0, B)], None),
+        ([(100.0, A)], [(110.0, A._replace(high=2.0))], None),
     ],
     ids=[
         "other places",
@@ -56,6 +57,7 @@ def test_the_same_effect_elsewhere_is_added_like_any_other():
         "the same, turned",
         "one of them goes on",
         "not the best",
+        "the same in another form",
     ],
 )
 def test_the_best_effect_at_other_places_goes_on_if_a_few_segments_hardly_tell(

@@ -253,13 +253,17 @@ def _at_other_places(best: Sequence[Fit], tried: Sequence[Fit]) -> list[Fit]:
         best: Those that go on, the best first.
         tried: All.
     """
-    known = [set(fit.units) for fit in best]
+    known = [_places(fit) for fit in best]
     others = [fit for fit in tried if _names(fit) == _names(best[0])]
-    others = [fit for fit in others if set(fit.units) not in known]
+    others = [fit for fit in others if _places(fit) not in known]
     if not others:
         return []
     first = min(others, key=lambda fit: _priced(fit, fit.misfit))
     return [] if outrun(first.cost, 0.0, best[0].cost) else [first]
+
+
+def _places(fit: Fit) -> frozenset[tuple[str, str]]:
+    return frozenset((unit.name, unit.where) for unit in fit.units)
 
 
 def _names(fit: Fit) -> frozenset[str]:
