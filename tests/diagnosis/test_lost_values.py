@@ -14,9 +14,9 @@ from test_diagnose import logs, system
 from torchrl_bayessim.diagnosis.chance import Chance
 from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.diagnosis.found import _matters as found_matters
-from torchrl_bayessim.diagnosis.loss_law import LossLaw, Tried, likeliest
+from torchrl_bayessim.diagnosis.loss_law import LossLaw, Told, Tried, likeliest
 from torchrl_bayessim.diagnosis.loss_suspects import Alone, _explained
-from torchrl_bayessim.diagnosis.losses import _of_one_drive, all_found, found_beside
+from torchrl_bayessim.diagnosis.losses import _explain, _of_one_drive, all_found, found_beside
 from torchrl_bayessim.diagnosis.model import Model
 from torchrl_bayessim.diagnosis.objective import Unit, units_of
 from torchrl_bayessim.diagnosis.shrinkage import Shrinkage
@@ -163,7 +163,7 @@ def test_friction_and_samples_that_are_not_renewed_are_both_named():
     assert low <= explained(report) <= high
 
 
-def short_segments(rng, *, lost, spoiled, left=0.0, size=8.0, count=60, steps=8):
+def short_segments(rng, *, lost, spoiled, left=0.0, size=8.0, count=60, steps=8, touching=False):
     """Segments that noise alone is in, and some with a lost value or spoiled by something else.
 
     Of the variances of noise that a lost value adds some may be left with the right pattern.
@@ -176,7 +176,10 @@ def short_segments(rng, *, lost, spoiled, left=0.0, size=8.0, count=60, steps=8)
         tried[1 + rng.integers(steps), s] -= 2.0 - left
     patterns = Tried(tried, np.r_[0, np.ones(steps, dtype=int)], values=steps)
     return SimpleNamespace(
-        tried=lambda unit: patterns, without=patterns.without, left=np.zeros((count, 16))
+        tried=lambda unit: patterns,
+        without=patterns.without,
+        left=np.zeros((count, 16)),
+        touching=touching,
     )
 
 
@@ -243,6 +246,33 @@ def test_losses_beside_an_effect_that_leave_some_show_in_runs_that_judge_as_in_t
     assert (losses_beside(data, CoulombFriction) is not None) == found
 
 
+@pytest.mark.parametrize(
+    ("left", "touching", "found"), [(1.5, False, True), (1.5, True, False), (0.0, True, True)]
+)
+def test_where_anything_touches_losses_beside_an_effect_leave_noise(left, touching, found):
+    """An impact that is a little off holds a velocity, too, and not quite."""
+    rng = np.random.default_rng(0)
+    given = {"lost": 12, "spoiled": 3, "left": left, "touching": touching}
+    data = {name: short_segments(rng, **given) for name in ("train", "validation", "test")}
+    assert (losses_beside(data, CoulombFriction) is not None) == found
+
+
+@pytest.mark.parametrize(("excess", "explains"), [(0.3, True), (0.02, False)])
+def test_losses_beside_an_effect_take_an_excess_and_not_noise(excess, explains):
+    """Of ever so many segments that have no more than noise many losses take some of that."""
+    law, count = LossLaw(share=0.15, scatter=1.0, spoiled=0.01, size=32), 50
+    before, after = np.full(count, 1.0 + excess), np.full(count, 0.95)
+    told = Told(np.ones(count), np.ones(count), np.zeros(count), before, after)
+    some = SimpleNamespace(law=law, gains=(45.0, 30.0), gain=75.0, unit=unit_of_samples())
+    alone = Alone(law, [0.0, 0.0], 0.01, count, touching=False)
+    others = (SimpleNamespace(effect=CoulombFriction()),)
+    assert _explain(some, told, alone=alone, others=others, lone=False) == explains
+
+
+def unit_of_samples():
+    return SimpleNamespace(effect=SensorDropout(), high=0.5)
+
+
 class Sensors:
     """Segments with a lost value each, of which every unit explains so many and no others."""
 
@@ -251,6 +281,7 @@ class Sensors:
         segments = short_segments(rng, lost=most, spoiled=spoiled, **given)
         every = segments.tried(None)
         self.left, self.without, self.parts = segments.left, segments.without, {}
+        self.touching = segments.touching
         for unit, k in lost:
             squares = every.squares.copy()
             squares[1:, spoiled + k : spoiled + most] += 8.0

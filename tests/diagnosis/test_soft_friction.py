@@ -9,7 +9,7 @@ from torchrl_bayessim.diagnosis.diagnose import diagnose
 from torchrl_bayessim.effects.effect import Reach
 from torchrl_bayessim.effects.friction import LoadDependentFriction
 
-NOISE = 0.002, 0.02  # rad, rad/s
+NOISE = 0.0005, 0.005  # rad, rad/s
 SOME = "load_dependent_friction", "coulomb_friction", "viscous_friction", "action_gain", "payload"
 
 
@@ -17,6 +17,7 @@ def driven(rng, steps, *, share, onset):
     """Return what is measured of an arm whose joint rubs by a share of what its motor exerts."""
     model = mujoco.MjModel.from_xml_string(ARM)
     model.opt.timestep /= FINER
+    model.dof_solref[:, 0] = 2 * model.opt.timestep  # not 10 ms before the joint turns round
     data = mujoco.MjData(model)
     data.qpos[0] = rng.normal(scale=0.5)
     u, measured, each = commands(rng, steps), [], 5 * FINER

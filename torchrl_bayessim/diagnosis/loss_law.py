@@ -25,6 +25,7 @@ from scipy.stats import binom, chi2
 Array = NDArray[np.float64]
 _FINER = np.geomspace(0.25, 4.0, 120)  # times the share of a coarse grid
 _MOST = 0.95  # of a share
+_SURE, _LEFT = 3.0, 0.05  # standard deviations of noise, or part of an excess, that may be left
 _WIDER = np.array([4.0, 16.0, 64.0, 256.0])  # κ, each as likely
 
 
@@ -128,6 +129,31 @@ class LossLaw:
             before=tried.squares[0],
             after=(likely * every).sum(0),
         )
+
+    def leaves_noise(self, before: Array, after: Array) -> bool:
+        """Return whether losses leave noise alone of the segments that say most of them.
+
+        With ``w`` the shares of segments in what losses explain, and ``σ² = 2 φ² Σ w² / M``::
+
+            Σ w (after - φ) < max(3 σ, 0.05 Σ w (before - φ))
+
+        Args:
+            before: Mean squared innovations of segments that have losses without them, ``(S,)``.
+            after: The same with them.
+
+        Example:
+            >>> law = LossLaw(share=0.1, scatter=1.0, spoiled=0.01, size=100)
+            >>> before = np.array([4.0, 4.0, 1.1])
+            >>> law.leaves_noise(before, np.array([1.1, 0.9, 1.0]))
+            True
+            >>> law.leaves_noise(before, np.array([1.6, 1.3, 1.0]))
+            False
+        """
+        weights = np.maximum(before - after, 0.0)
+        weights = weights / max(weights.sum(), 1e-300)
+        chance = self.scatter * np.sqrt(2.0 / self.size) * np.linalg.norm(weights)
+        most = max(_SURE * chance, _LEFT * weights @ (before - self.scatter))
+        return bool(weights @ (after - self.scatter) < most)
 
     def likely(self, tried: Tried) -> Array:
         """Return how likely each pattern is, and last that a segment is spoiled, ``(B + 1, S)``."""

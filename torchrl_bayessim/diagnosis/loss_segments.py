@@ -55,6 +55,11 @@ class LossSegments:
         return self.of(self.objective, point)
 
     @property
+    def touching(self) -> bool:
+        """Whether anything may touch anything."""
+        return self.objective.predictor.colliding
+
+    @property
     def without(self) -> Tried:
         """The segments without losses."""
         squares = (self.left**2).mean(-1)[None]

@@ -34,12 +34,21 @@ LEFT = 2.0  # mean squared innovation of what has not explained the losses
 
 
 class Alone(NamedTuple):
-    """The likeliest law without losses, its deviances, and the share of segments it gives up."""
+    """The likeliest law without losses.
+
+    Attributes:
+        law: The law.
+        costs: Its deviances, of the splits that judge.
+        spoiled: The share of segments it gives up.
+        segments: How many there are.
+        touching: Whether anything may touch anything in them.
+    """
 
     law: LossLaw
     costs: list[float]
     spoiled: float
     segments: int
+    touching: bool
 
     @property
     def calm(self) -> bool:
@@ -52,9 +61,8 @@ class Alone(NamedTuple):
         judged, size = [data[name].without for name in JUDGED], data["train"].left.shape[1]
         law = likeliest(judged, (0.0,), SCATTER.tolist(), SPOILED, size=size)
         told = Told.joined([law.told(one) for one in judged])
-        return cls(
-            law, [law.deviance([one]) for one in judged], spoiled_share(told), len(told.spoiled)
-        )
+        costs, touching = [law.deviance([one]) for one in judged], data["train"].touching
+        return cls(law, costs, spoiled_share(told), len(told.spoiled), touching)
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,7 +49,7 @@ Array = NDArray[np.float64]
 SHARES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.25, 0.4, 0.6)  # s
 # deviances: to be found (contacts that come late look like a few losses), and that chance makes
 _NEEDED, _LIKELY = 40.0, 6.0
-_EXPLAINED = 0.5  # of the excess of the segments concerned, by what is left of them
+_EXPLAINED = 0.5  # of the excess of the segments concerned; no more is left, or taken of noise
 _CLEARLY = 0.1  # of it may be left of what is found clearly
 _ELSEWHERE = 0.5  # of what lost commands of a drive explain, by those of another
 _AS_MUCH = 0.15  # of what losses explain in the runs of the fit, by those in runs that judge
@@ -253,7 +253,7 @@ def _explain(
     losses: _Losses, known: Told, *, alone: Alone, others: Sequence[Unit], lone: bool
 ) -> bool:
     """Return whether losses explain the segments that have them, and little else is wrong."""
-    law, gains, unit = losses.law, losses.gains, losses.unit
+    law, gains = losses.law, losses.gains
     concerned = known.lost > LIKELIER
     if concerned.sum() < FEWEST:
         return False
@@ -276,8 +276,19 @@ def _explain(
     spoiled = max(_OTHERS, _REMAIN * alone.spoiled, WRONG if surely else 0.0)
     if law.scatter > noise or spoiled_share(known) > spoiled:
         return False  # something else is wrong everywhere, and may look like this
-    if after > _EXPLAINED * before:
+    if abs(after) > _EXPLAINED * before:
         return False
-    seen = losses.gain > _SEEN * concerned.sum()
-    plausible = clear and seen and law.share <= unit.high
-    return plausible or not (others and isinstance(unit.effect, PacketDrop))
+    return not others or _plausible_beside(losses, known, clear=clear, touching=alone.touching)
+
+
+def _plausible_beside(losses: _Losses, known: Told, *, clear: bool, touching: bool) -> bool:
+    """Return whether losses beside effects are what they look like.
+
+    Commands have to be seen one by one. Of samples, where anything may touch, losses have to leave
+    noise: an impact that is a little off holds a velocity, too, in a few segments and not quite.
+    """
+    law, unit = losses.law, losses.unit
+    concerned = known.lost > LIKELIER
+    if isinstance(unit.effect, PacketDrop):
+        return clear and losses.gain > _SEEN * concerned.sum() and law.share <= unit.high
+    return not touching or law.leaves_noise(known.before[concerned], known.after[concerned])

@@ -36,6 +36,7 @@ from ..envs.model_batch import ModelBatch
 from ..envs.stepper import Stepper
 from ..envs.task import Readings
 from ..logs.system import System
+from ..physics.dry_friction import FIELDS, follow_velocity
 from .commands import commanded
 from .segments import Segments
 from .sensing import Sensing
@@ -100,6 +101,9 @@ class Predictor:
         task = self.system.task
         model = copy.copy(task.model)
         model.opt.timestep = task.dt / substeps
+        physics = self.system.physics
+        if physics is None or not FIELDS & physics.fields:
+            follow_velocity(model)
         if not self.colliding:
             # looking for contacts that cannot be takes an eighth of the time
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT

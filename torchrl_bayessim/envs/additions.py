@@ -4,13 +4,14 @@ An *addition* is a function of the states before a time step, tensors ``(*batch,
 ``qvel``, ``time``, ``ctrl`` and ``qfrc_bias`` (`BeforeStep`). It returns what is added in that time
 step alone to ``ctrl`` (seen by the additions that follow), to ``qfrc_applied``, or to the model's
 ``dof_frictionloss`` and ``dof_damping``; whatever else has set these stays in force underneath.
+Where there was no dry friction, what is added follows the velocity (`dry_friction`).
 """
 
 from __future__ import annotations
 
 __all__ = ["Addition", "rollout_with", "steps_with"]
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 
 import mujoco
@@ -19,13 +20,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..physics.dry_friction import FIELDS as OF_FRICTION
+from ..physics.dry_friction import follow_velocity, reference
 from .bias_forces import BeforeStep, BiasForces, bias_force
 from .held_command import HeldCommand
+from .model_batch import ModelBatch
 from .stepper import Stepper
 
 Addition = Callable[[BeforeStep], Mapping[str, Tensor]]
 _FIELDS = "dof_frictionloss", "dof_damping"
 _Array = NDArray[np.float64]
+_Entry = tuple[str, tuple[int, ...]]
 
 
 def rollout_with(
@@ -50,7 +55,7 @@ def rollout_with(
     """
     models, count, nu = stepper.models, stepper.models.model.nv, len(stepper.relative)
     base = {f: [models.read(f, (d,)) for d in range(count)] for f in _FIELDS}
-    applied = stepper["qfrc_applied"].copy()
+    applied, solved = stepper["qfrc_applied"].copy(), dict[_Entry, _Array]()
     bias, rows = bias or BiasForces(stepper), np.arange(stepper.num_envs)
     outputs = np.full((*commands.shape[:2], stepper.output_size), np.nan)
     after = np.empty((stepper.num_envs, 1, stepper.output_size))
@@ -65,6 +70,8 @@ def rollout_with(
             for field in _FIELDS:
                 for d, value in enumerate(base[field] if field in added else ()):
                     models.write(field, (d,), value + added[field][:, d])
+            if "dof_frictionloss" in added and not solved:
+                solved = _followed(models, base["dof_frictionloss"])
             command = held.again(commands[:, t]).copy()
             command[:, :nu] += added.get("ctrl", 0.0)
             stepper.rollout(command[:, None], substeps=1, rows=rows, outputs=after, ends=not left)
@@ -75,7 +82,25 @@ def rollout_with(
         for d, value in enumerate(values):
             if not np.array_equal(models.read(field, (d,)), value):
                 models.write(field, (d,), value)
+    for entry, value in solved.items():
+        models.write(*entry, value)
     return outputs
+
+
+def _followed(models: ModelBatch, friction: Sequence[_Array]) -> dict[_Entry, _Array]:
+    """Let dry friction follow the velocity where there is none, and return what held before.
+
+    Args:
+        models: The models.
+        friction: Of every degree of freedom, shape ``(N,)`` each.
+    """
+    before = {}
+    for d, own in enumerate(friction):
+        for (field, column), value in reference(float(models.model.opt.timestep)).items():
+            entry = field, (d, *column)
+            before[entry] = models.read(*entry)
+            models.write(*entry, np.where(own == 0, value, before[entry]))
+    return before
 
 
 def steps_with(
@@ -83,7 +108,8 @@ def steps_with(
 ) -> None:
     """Step one simulation ``count`` times under its present controls, with additions each time."""
     control, applied = data.ctrl.copy(), data.qfrc_applied.copy()
-    base = {field: getattr(model, field).copy() for field in _FIELDS}
+    base = {field: getattr(model, field).copy() for field in {*_FIELDS, *OF_FRICTION}}
+    followed = False
     try:
         for _ in range(count):
             state = {n: torch.from_numpy(getattr(data, n).copy()) for n in ("qpos", "qvel")}
@@ -93,14 +119,17 @@ def steps_with(
             added = _total(additions, now)
             data.ctrl[:] = control + added.get("ctrl", 0.0)
             data.qfrc_applied[:] = applied + added.get("qfrc_applied", 0.0)
+            if "dof_frictionloss" in added and not followed:
+                follow_velocity(model)
+                followed = True
             for field in _FIELDS:
                 getattr(model, field)[:] = base[field] + added.get(field, 0.0)
             mujoco.mj_step(model, data)
     finally:
         data.ctrl[:] = control
         data.qfrc_applied[:] = applied
-        for field in _FIELDS:
-            getattr(model, field)[:] = base[field]
+        for field, values in base.items():
+            getattr(model, field)[:] = values
 
 
 def _total(additions: Iterable[Addition], now: BeforeStep) -> dict[str, _Array]:
