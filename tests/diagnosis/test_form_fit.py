@@ -159,12 +159,12 @@ def test_bristles_are_dry_friction_with_the_way_that_they_bend():
 
 def test_friction_of_one_direction_that_begins_softly_has_the_speed_over_which_it_does():
     some = ["coulomb_friction", "directional_friction", "viscous_friction", "action_bias"]
-    soft = logs(push=lambda q, v: -0.3 * (1 - np.exp(-v / 0.3)) if v > 0 else 0.0)
+    soft = logs(10, push=lambda q, v: -0.3 * (1 - np.exp(-v / 0.8)) if v > 0 else 0.0)
     report = diagnose(robot(), None, soft, effects=some)
     assert [effect.name for effect in report.effects] == ["directional_friction"]
     assert report.effects[0].strength == pytest.approx(0.3, rel=0.1)
     (found,) = report.strengths
-    assert found.onset == pytest.approx(0.3, rel=0.25)
+    assert found.onset == pytest.approx(0.8, rel=0.25)
     assert report.gap.with_effects < 1.5
 
 

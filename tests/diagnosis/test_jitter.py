@@ -202,19 +202,19 @@ def test_losses_are_outdone_only_by_jitter_that_is_plainly_likelier(prepared):
     assert not outdone(suspects, [lost(cost + 41, 100.0)], [])
 
 
-def test_jitter_is_named_beside_friction_in_the_place_of_a_lag():
-    data = logs(12, act=late(1, 1.5), push=lambda q, v: -0.3 * np.tanh(v / 0.01))
-    report = diagnose(system(), None, data, effects=SOME)
+def test_jitter_is_named_beside_drag_in_the_place_of_a_lag():
+    data = logs(12, act=late(1, 1.5), push=lambda q, v: -0.04 * v * abs(v))
+    report = diagnose(system(), None, data, effects=[*SOME, "quadratic_drag"])
     found = {effect.name: effect for effect in report.effects}
-    assert set(found) == {"action_jitter", "coulomb_friction"}
-    assert found["coulomb_friction"].strength == pytest.approx(0.3, rel=0.1)
+    assert set(found) == {"action_jitter", "quadratic_drag"}
+    assert found["quadratic_drag"].strength == pytest.approx(0.04, rel=0.1)
     low, high = found["action_jitter"].ci95
     assert low < 0.015 < high
     assert 0.3 < found["action_jitter"].share_of_gap < 0.95
     assert sum(one.share_of_gap for one in found.values()) <= 1.0
     assert report.gap.with_effects < 1.4
     assert any("as late as jitter makes them" in alarm for alarm in report.alarms)
-    assert {c.name for c in report.candidates} == set(SOME)
+    assert {c.name for c in report.candidates} == {*SOME, "quadratic_drag"}
     assert {c.status for c in report.candidates if c.name == "action_jitter"} == {"named"}
 
 
