@@ -134,3 +134,13 @@ def test_what_varies_otherwise_is_not_told():
     base, _ = base_and_better(lambda s: s["elsewhere"], lambda s: s["drift"])
     assert base.mean_square > 50
     assert wavering_alarms(base, Rows(**vars(SEGMENTS))) == []
+
+
+def test_one_of_several_that_does_nothing_does_not_vary():
+    base, _ = base_and_better(lambda s: RUN[:, None] * s["bias"], lambda s: s["drift"])
+    fit = base.fit
+    point = Point(fit.point.z, {A: 1.0, C: 0.0})
+    jacobian = np.c_[fit.jacobian, np.ones(len(fit.jacobian))]
+    idle = Model(Fit(point, (A, C), fit.innovations, jacobian), base.validation, base.logs)
+    rows = Rows(**vars(SEGMENTS))
+    assert wavering_alarms(idle, rows) == wavering_alarms(base, rows) != []

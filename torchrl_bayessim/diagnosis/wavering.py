@@ -64,10 +64,13 @@ def wavering_alarms(model: Model, segments: Segments) -> list[str]:
         return []
     texts: dict[float, str] = {}
     for unit in model.units:
+        size = float(np.mean(fit.change(unit) ** 2))
+        if size == 0:  # one of several joints that does nothing
+            continue
         loose = _loose(fit, [unit], segments)
         left, part = _left(fit, loose, 1.0)
         share = (fit.cost - left - price(model) * _numbers(loose)) / beyond
-        spread = float(np.sqrt(np.mean((loose @ part) ** 2) / np.mean(fit.change(unit) ** 2)))
+        spread = float(np.sqrt(np.mean((loose @ part) ** 2) / size))
         texts[share] = (
             f"{plain(unit.name)} at {unit.where} seems to vary by {100 * spread:.0f} % of itself, "
             f"from run to run or within runs: that explains {100 * min(share, 1):.0f} % of what "
