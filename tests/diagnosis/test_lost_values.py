@@ -163,7 +163,7 @@ def test_friction_and_samples_that_are_not_renewed_are_both_named():
     assert low <= explained(report) <= high
 
 
-def short_segments(rng, *, lost, spoiled, left=0.0, size=8.0, count=60, steps=8, touching=False):
+def short_segments(rng, *, lost, spoiled, left=0.0, size=8.0, count=60, steps=8, colliding=False):
     """Segments that noise alone is in, and some with a lost value or spoiled by something else.
 
     Of the variances of noise that a lost value adds some may be left with the right pattern.
@@ -179,7 +179,7 @@ def short_segments(rng, *, lost, spoiled, left=0.0, size=8.0, count=60, steps=8,
         tried=lambda unit: patterns,
         without=patterns.without,
         left=np.zeros((count, 16)),
-        touching=touching,
+        colliding=colliding,
     )
 
 
@@ -247,12 +247,12 @@ def test_losses_beside_an_effect_that_leave_some_show_in_runs_that_judge_as_in_t
 
 
 @pytest.mark.parametrize(
-    ("left", "touching", "found"), [(1.5, False, True), (1.5, True, False), (0.0, True, True)]
+    ("left", "colliding", "found"), [(1.5, False, True), (1.5, True, False), (0.0, True, True)]
 )
-def test_where_anything_touches_losses_beside_an_effect_leave_noise(left, touching, found):
+def test_where_anything_touches_losses_beside_an_effect_leave_noise(left, colliding, found):
     """An impact that is a little off holds a velocity, too, and not quite."""
     rng = np.random.default_rng(0)
-    given = {"lost": 12, "spoiled": 3, "left": left, "touching": touching}
+    given = {"lost": 12, "spoiled": 3, "left": left, "colliding": colliding}
     data = {name: short_segments(rng, **given) for name in ("train", "validation", "test")}
     assert (losses_beside(data, CoulombFriction) is not None) == found
 
@@ -264,7 +264,7 @@ def test_losses_beside_an_effect_take_an_excess_and_not_noise(excess, explains):
     before, after = np.full(count, 1.0 + excess), np.full(count, 0.95)
     told = Told(np.ones(count), np.ones(count), np.zeros(count), before, after)
     some = SimpleNamespace(law=law, gains=(45.0, 30.0), gain=75.0, unit=unit_of_samples())
-    alone = Alone(law, [0.0, 0.0], 0.01, count, touching=False)
+    alone = Alone(law, [0.0, 0.0], 0.01, count, colliding=False)
     others = (SimpleNamespace(effect=CoulombFriction()),)
     assert _explain(some, told, alone=alone, others=others, lone=False) == explains
 
@@ -281,7 +281,7 @@ class Sensors:
         segments = short_segments(rng, lost=most, spoiled=spoiled, **given)
         every = segments.tried(None)
         self.left, self.without, self.parts = segments.left, segments.without, {}
-        self.touching = segments.touching
+        self.colliding = segments.colliding
         for unit, k in lost:
             squares = every.squares.copy()
             squares[1:, spoiled + k : spoiled + most] += 8.0

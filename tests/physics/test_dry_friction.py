@@ -4,19 +4,24 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from torchrl.envs import Compose, TransformedEnv
 
 from torchrl_bayessim.diagnosis.prediction import Predictor
+from torchrl_bayessim.diagnosis.segments import cut
 from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.effects.fields import ModelFields
 from torchrl_bayessim.effects.robot import robot_of
 from torchrl_bayessim.envs.additions import rollout_with, steps_with
 from torchrl_bayessim.envs.model_batch import ModelBatch
+from torchrl_bayessim.envs.mujoco import BatchedMujocoEnv
 from torchrl_bayessim.envs.stepper import Stepper
 from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.inference.priors import BoxPrior
+from torchrl_bayessim.logs.log import Log
 from torchrl_bayessim.logs.system import System
 from torchrl_bayessim.physics.dry_friction import follow_velocity, reference
 from torchrl_bayessim.physics.mujoco import MujocoPhysics
+from torchrl_bayessim.transforms import ApplyEffect, ApplyPhysics
 
 ARM = """
 <mujoco><option timestep="{dt}" integrator="{integrator}" gravity="0 0 0"/>
@@ -72,12 +77,13 @@ def test_friction_that_follows_the_velocity_is_coulombs(integrator, share):
     assert after < share * before
 
 
-def test_what_sticks_creeps_no_faster_than_friction_changes_the_velocity_in_a_time_step():
-    model = arm()
+@pytest.mark.parametrize("timestep", [0.001, 0.0025, 0.01])
+def test_what_sticks_creeps_by_half_of_what_friction_changes_in_a_time_step(timestep):
+    model = arm(timestep)
     follow_velocity(model)
     model.dof_frictionloss[0] = FRICTION
     creep = driven(model, [0.9 * FRICTION] * 50)[-1, 1]
-    assert 0 < creep < FRICTION * model.opt.timestep / INERTIA
+    assert creep == pytest.approx(0.9 * FRICTION * 0.5 * timestep / INERTIA, rel=0.1)
     assert driven(model, [1.5 * FRICTION] * 50)[-1, 1] == pytest.approx(0.5, rel=0.02)  # it slides
 
 
@@ -130,14 +136,73 @@ def test_friction_that_is_added_in_every_time_step_follows_and_leaves_nothing_be
     assert single.dof_solimp[0, :2].tolist() == [0.9, 0.95]
 
 
+def test_an_addition_that_raises_leaves_nothing_behind():
+    def breaks(now):
+        if float(now.time.max()) > 0.01:
+            raise RuntimeError("out of friction")
+        return rub(now)
+
+    stepper = Stepper(arm(), 1, threads=1)
+    with pytest.raises(RuntimeError, match="out of friction"):
+        rollout_with(stepper, [breaks], np.ones((1, 3, 1)), substeps=8)
+    assert stepper.models.read("dof_frictionloss", (0,)).tolist() == [0.0]
+    assert stepper.models.read("dof_solref", (0, 0)).tolist() == [0.02]
+
+
+def test_a_reference_that_somebody_has_chosen_stays():
+    text = ARM.format(dt=0.0025, own=0.0, integrator="RK4")
+    text = text.replace("frictionloss=", 'solreffriction="-1 -50" frictionloss=')
+    model = mujoco.MjModel.from_xml_string(text)
+    follow_velocity(model)
+    assert model.dof_solref[0].tolist() == [-1.0, -50.0]
+    models = ModelBatch(model, 1)
+    robot = robot_of(Task(model=model, frame_skip=8))
+    effect("coulomb_friction").write(ModelFields(models), torch.tensor([[0.2]]).double(), robot)
+    assert models.read("dof_solref", (0, 1)).tolist() == [-50.0]
+    stepper = Stepper(model, 1, threads=1)
+    torques = np.random.default_rng(1).normal(size=20)
+    added = rollout_with(stepper, [rub], torques[None, :, None], substeps=8)
+    model.dof_frictionloss[0] = FRICTION
+    np.testing.assert_allclose(added[0, :, :2], driven(model, torques), atol=1e-9)
+
+
+TWO = """
+<mujoco><option timestep="0.0025" integrator="RK4"/><worldbody>
+<body name="upper"><joint name="shoulder" axis="0 1 0" damping="0.1"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03" contype="0" conaffinity="0"/>
+  <body name="lower" pos="0 0 -0.4"><joint name="elbow" axis="0 1 0" damping="0.1"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03" contype="0" conaffinity="0"/>
+</body></body></worldbody>
+<actuator><motor joint="shoulder"/><motor joint="elbow"/></actuator></mujoco>
+"""
+
+
 @pytest.mark.parametrize(
-    ("parameter", "bounds", "follows"),
-    [("body_mass[link]", (0.5, 2.0), True), ("dof_frictionloss[hinge]", (0.0, 0.5), False)],
+    "name", ["coulomb_friction", "stribeck_friction", "load_dependent_friction"]
 )
-def test_friction_among_the_parameters_is_that_of_the_users_simulator(parameter, bounds, follows):
-    parts = MujocoPhysics(parameter), BoxPrior({parameter: bounds})
-    task = Task(model=arm(), frame_skip=8)
+@pytest.mark.parametrize("parameter", ["body_mass[upper]", "dof_frictionloss[shoulder]"])
+def test_replay_and_environment_agree_joint_by_joint(name, parameter):
+    """Friction among the parameters is that of the user's simulator, of that joint alone."""
+    parts = MujocoPhysics(parameter), BoxPrior({parameter: (0.05, 5.0)})
+    task = Task(model=mujoco.MjModel.from_xml_string(TWO), frame_skip=8)
+    theta = np.array([[1.5 if "mass" in parameter else 0.1]])
+    rubbing = ApplyEffect(name, {"shoulder": 0.0, "elbow": 0.1})
+    env = TransformedEnv(BatchedMujocoEnv(task, 1), Compose(ApplyPhysics(parts[0]), rubbing))
+    generator = torch.Generator().manual_seed(0)
+    start = env.full_state_spec.zero().set("theta", torch.from_numpy(theta))
+    now, rows = env.reset(start), []
+    for _ in range(30):
+        action = torch.randn(1, 2, generator=generator, dtype=torch.float64)
+        rows.append((now["observation"][0].double().numpy(), action[0].numpy()))
+        now = env.step(now.set("action", action.to(env.action_spec.dtype)))["next"]
+    state, ctrl = (np.stack(part) for part in zip(*rows, strict=True))
+    log = Log(
+        name="run", time=torch.arange(30).double() * task.dt, ctrl=torch.from_numpy(ctrl),
+        qpos=torch.from_numpy(state[:, :2].copy()), qvel=torch.from_numpy(state[:, 2:].copy()),
+        velocity_gain=torch.zeros(2).double(), measured=torch.ones(4, dtype=torch.bool),
+    )  # fmt: skip
     predictor = Predictor(System(task=task, physics=parts[0], prior=parts[1]))
-    model = predictor._stepper.models.model
-    assert (model.dof_solref[0, 0] < 0) == follows
-    assert task.model.dof_solref[0, 0] == 0.02
+    predictor.exactly()
+    pieces = cut([log], 25, history=1, stride=25)
+    strengths = {effect(name): np.array([[0.0, 0.1]])}
+    assert np.abs(predictor.residuals(pieces, theta, strengths)).max() < 1e-4  # single precision

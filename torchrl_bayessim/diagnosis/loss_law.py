@@ -133,7 +133,8 @@ class LossLaw:
     def leaves_noise(self, before: Array, after: Array) -> bool:
         """Return whether losses leave noise alone of the segments that say most of them.
 
-        With ``w`` the shares of segments in what losses explain, and ``σ² = 2 φ² Σ w² / M``::
+        With ``w`` the shares of segments in what losses explain, ``φ`` no less than noise, 1, since
+        its grid is coarse, and ``σ² = 2 φ² Σ w² / M``::
 
             Σ w (after - φ) < max(3 σ, 0.05 Σ w (before - φ))
 
@@ -151,9 +152,10 @@ class LossLaw:
         """
         weights = np.maximum(before - after, 0.0)
         weights = weights / max(weights.sum(), 1e-300)
-        chance = self.scatter * np.sqrt(2.0 / self.size) * np.linalg.norm(weights)
-        most = max(_SURE * chance, _LEFT * weights @ (before - self.scatter))
-        return bool(weights @ (after - self.scatter) < most)
+        noise = max(self.scatter, 1.0)
+        chance = noise * np.sqrt(2.0 / self.size) * np.linalg.norm(weights)
+        most = max(_SURE * chance, _LEFT * weights @ (before - noise))
+        return bool(weights @ (after - noise) < most)
 
     def likely(self, tried: Tried) -> Array:
         """Return how likely each pattern is, and last that a segment is spoiled, ``(B + 1, S)``."""

@@ -55,8 +55,8 @@ class LossSegments:
         return self.of(self.objective, point)
 
     @property
-    def touching(self) -> bool:
-        """Whether anything may touch anything."""
+    def colliding(self) -> bool:
+        """Whether anything of the robot may touch anything."""
         return self.objective.predictor.colliding
 
     @property

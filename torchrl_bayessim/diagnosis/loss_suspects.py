@@ -41,14 +41,14 @@ class Alone(NamedTuple):
         costs: Its deviances, of the splits that judge.
         spoiled: The share of segments it gives up.
         segments: How many there are.
-        touching: Whether anything may touch anything in them.
+        colliding: Whether anything of the robot may touch anything.
     """
 
     law: LossLaw
     costs: list[float]
     spoiled: float
     segments: int
-    touching: bool
+    colliding: bool
 
     @property
     def calm(self) -> bool:
@@ -61,8 +61,8 @@ class Alone(NamedTuple):
         judged, size = [data[name].without for name in JUDGED], data["train"].left.shape[1]
         law = likeliest(judged, (0.0,), SCATTER.tolist(), SPOILED, size=size)
         told = Told.joined([law.told(one) for one in judged])
-        costs, touching = [law.deviance([one]) for one in judged], data["train"].touching
-        return cls(law, costs, spoiled_share(told), len(told.spoiled), touching)
+        costs, colliding = [law.deviance([one]) for one in judged], data["train"].colliding
+        return cls(law, costs, spoiled_share(told), len(told.spoiled), colliding)
 
 
 @dataclass(frozen=True, eq=False)

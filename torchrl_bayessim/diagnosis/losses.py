@@ -49,7 +49,8 @@ Array = NDArray[np.float64]
 SHARES = (0.01, 0.02, 0.04, 0.08, 0.15, 0.25, 0.4, 0.6)  # s
 # deviances: to be found (contacts that come late look like a few losses), and that chance makes
 _NEEDED, _LIKELY = 40.0, 6.0
-_EXPLAINED = 0.5  # of the excess of the segments concerned; no more is left, or taken of noise
+# of the excess of the segments concerned, by what is left; beside effects also taken of noise
+_EXPLAINED = 0.5
 _CLEARLY = 0.1  # of it may be left of what is found clearly
 _ELSEWHERE = 0.5  # of what lost commands of a drive explain, by those of another
 _AS_MUCH = 0.15  # of what losses explain in the runs of the fit, by those in runs that judge
@@ -276,19 +277,20 @@ def _explain(
     spoiled = max(_OTHERS, _REMAIN * alone.spoiled, WRONG if surely else 0.0)
     if law.scatter > noise or spoiled_share(known) > spoiled:
         return False  # something else is wrong everywhere, and may look like this
-    if abs(after) > _EXPLAINED * before:
+    if (abs(after) if others else after) > _EXPLAINED * before:
         return False
-    return not others or _plausible_beside(losses, known, clear=clear, touching=alone.touching)
+    return not others or _plausible_beside(losses, known, clear=clear, colliding=alone.colliding)
 
 
-def _plausible_beside(losses: _Losses, known: Told, *, clear: bool, touching: bool) -> bool:
+def _plausible_beside(losses: _Losses, known: Told, *, clear: bool, colliding: bool) -> bool:
     """Return whether losses beside effects are what they look like.
 
-    Commands have to be seen one by one. Of samples, where anything may touch, losses have to leave
-    noise: an impact that is a little off holds a velocity, too, in a few segments and not quite.
+    Commands have to be seen one by one. Where a robot may touch something, samples that were lost
+    have to leave noise: an impact that is a little off holds a velocity, too, in a few segments and
+    not quite.
     """
     law, unit = losses.law, losses.unit
     concerned = known.lost > LIKELIER
     if isinstance(unit.effect, PacketDrop):
         return clear and losses.gain > _SEEN * concerned.sum() and law.share <= unit.high
-    return not touching or law.leaves_noise(known.before[concerned], known.after[concerned])
+    return not colliding or law.leaves_noise(known.before[concerned], known.after[concerned])

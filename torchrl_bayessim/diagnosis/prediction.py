@@ -101,9 +101,7 @@ class Predictor:
         task = self.system.task
         model = copy.copy(task.model)
         model.opt.timestep = task.dt / substeps
-        physics = self.system.physics
-        if physics is None or not FIELDS & physics.fields:
-            follow_velocity(model)
+        follow_velocity(model, but=self._own_friction(model))
         if not self.colliding:
             # looking for contacts that cannot be takes an eighth of the time
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
@@ -118,6 +116,13 @@ class Predictor:
         }
         self._stepper = Stepper(model, 1, drive=task.drive, threads=self._threads)
         self._bias = BiasForces(self._stepper)
+
+    def _own_friction(self, model: mujoco.MjModel) -> list[int]:
+        """Return the degrees of freedom whose dry friction is among the parameters."""
+        physics = self.system.physics
+        groups = [] if physics is None else physics.entries(model)
+        entries = [entry for group in groups for entry in group if entry.field in FIELDS]
+        return [int(place[0]) for entry in entries for place in entry.indices]
 
     @property
     def colliding(self) -> bool:

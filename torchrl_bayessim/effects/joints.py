@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from ..physics.dry_friction import reference
+from ..physics.dry_friction import DEFAULT, reference
 from .effect import Effect, Fields, ModelEffect, Reach
 from .friction import PowerLawFriction, PreslidingFriction
 from .laws import within
@@ -48,8 +48,8 @@ class _Joint(ModelEffect):
 class CoulombFriction(_Joint):
     """Dry friction of ``s``; N m or N, 0 to 30 % of ``F_max``.
 
-    Joints without dry friction of their own stick and turn round as Coulomb's law says, see
-    `dry_friction`; that of others is softer, as MuJoCo's is and the model's options say.
+    In joints without dry friction of their own it turns round with the velocity, see
+    `dry_friction`; in others it does as the model's own does.
 
     By the same name, with an option ``presliding``: `friction.PreslidingFriction`.
     """
@@ -68,13 +68,12 @@ class CoulombFriction(_Joint):
 
     def write(self, fields: Fields, strength: Tensor, robot: Robot) -> None:
         """Add to the joints' dry friction, which follows the velocity where there was none."""
-        known = reference(float(robot.require_model().opt.timestep))
-        indices = self._indices(robot)
+        steps, indices = fields["opt.timestep", ()], self._indices(robot)
+        known = reference(float(steps.flatten()[0]))
         free = [fields[self.field, (dof,)] == 0 for dof in indices]
         super().write(fields, strength, robot)
         for j, dof in enumerate(indices):
-            # a model may have been told of a time step of its own
-            new = free[j] & (strength[..., j] != 0) & (fields["dof_solref", (dof, 0)] > 0)
+            new = free[j] & (strength[..., j] != 0) & (fields["dof_solref", (dof, 0)] == DEFAULT)
             for (name, column), value in known.items() if new.any() else ():
                 entry = name, (dof, *column)
                 fields[entry] = torch.where(new, value, fields[entry])

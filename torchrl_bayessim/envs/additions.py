@@ -11,7 +11,7 @@ from __future__ import annotations
 
 __all__ = ["Addition", "rollout_with", "steps_with"]
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 
 import mujoco
@@ -20,8 +20,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..physics.dry_friction import FIELDS as OF_FRICTION
-from ..physics.dry_friction import follow_velocity, reference
+from ..physics import dry_friction
+from ..physics.dry_friction import DEFAULT, follow_velocity, reference
 from .bias_forces import BeforeStep, BiasForces, bias_force
 from .held_command import HeldCommand
 from .model_batch import ModelBatch
@@ -53,54 +53,73 @@ def rollout_with(
     Returns:
         The outputs after each command, shape ``(N, T, M)``; NaN after a divergence.
     """
-    models, count, nu = stepper.models, stepper.models.model.nv, len(stepper.relative)
-    base = {f: [models.read(f, (d,)) for d in range(count)] for f in _FIELDS}
-    applied, solved = stepper["qfrc_applied"].copy(), dict[_Entry, _Array]()
+    nu, resistance = len(stepper.relative), _Resistance(stepper.models)
+    applied = stepper["qfrc_applied"].copy()
     bias, rows = bias or BiasForces(stepper), np.arange(stepper.num_envs)
     outputs = np.full((*commands.shape[:2], stepper.output_size), np.nan)
     after = np.empty((stepper.num_envs, 1, stepper.output_size))
-    for t in range(commands.shape[1]):
-        held = HeldCommand(stepper, np.arange(stepper.num_envs))
-        control = torch.from_numpy(held.controls(commands[:, t]))
-        for left in reversed(range(substeps)):
-            names = "qpos", "qvel", "time"
-            state = {name: torch.from_numpy(stepper[name]) for name in names}
-            added = _total(additions, BeforeStep(bias, ctrl=control, **state))
-            stepper["qfrc_applied"][:] = applied + added.get("qfrc_applied", 0.0)
-            for field in _FIELDS:
-                for d, value in enumerate(base[field] if field in added else ()):
-                    models.write(field, (d,), value + added[field][:, d])
-            if "dof_frictionloss" in added and not solved:
-                solved = _followed(models, base["dof_frictionloss"])
-            command = held.again(commands[:, t]).copy()
-            command[:, :nu] += added.get("ctrl", 0.0)
-            stepper.rollout(command[:, None], substeps=1, rows=rows, outputs=after, ends=not left)
-            rows = rows[stepper.status[rows] == 0]
-        outputs[rows, t] = after[rows, 0]
-    stepper["qfrc_applied"][:] = applied
-    for field, values in base.items():
-        for d, value in enumerate(values):
-            if not np.array_equal(models.read(field, (d,)), value):
-                models.write(field, (d,), value)
-    for entry, value in solved.items():
-        models.write(*entry, value)
+    try:
+        for t in range(commands.shape[1]):
+            held = HeldCommand(stepper, np.arange(stepper.num_envs))
+            control = torch.from_numpy(held.controls(commands[:, t]))
+            for left in reversed(range(substeps)):
+                names = "qpos", "qvel", "time"
+                state = {name: torch.from_numpy(stepper[name]) for name in names}
+                added = _total(additions, BeforeStep(bias, ctrl=control, **state))
+                stepper["qfrc_applied"][:] = applied + added.get("qfrc_applied", 0.0)
+                resistance.add(added)
+                command = held.again(commands[:, t]).copy()
+                command[:, :nu] += added.get("ctrl", 0.0)
+                stepper.rollout(
+                    command[:, None], substeps=1, rows=rows, outputs=after, ends=not left
+                )
+                rows = rows[stepper.status[rows] == 0]
+            outputs[rows, t] = after[rows, 0]
+    finally:
+        stepper["qfrc_applied"][:] = applied
+        resistance.restore()
     return outputs
 
 
-def _followed(models: ModelBatch, friction: Sequence[_Array]) -> dict[_Entry, _Array]:
-    """Let dry friction follow the velocity where there is none, and return what held before.
+class _Resistance:
+    """Dry friction and damping of models, and what is added to them.
 
     Args:
-        models: The models.
-        friction: Of every degree of freedom, shape ``(N,)`` each.
+        models: The models, of ``N`` simulations.
     """
-    before = {}
-    for d, own in enumerate(friction):
+
+    def __init__(self, models: ModelBatch) -> None:
+        self._models = models
+        dofs = range(models.model.nv)
+        self._own = {f: [models.read(f, (d,)) for d in dofs] for f in _FIELDS}
+        self._before: dict[_Entry, _Array] = {}
+
+    def add(self, added: Mapping[str, _Array]) -> None:
+        """Set what there is with what is added in this time step, ``(N, nv)`` of each field."""
+        for field, own in self._own.items():
+            for d, value in enumerate(own if field in added else ()):
+                self._models.write(field, (d,), value + added[field][:, d])
+        rubbed = added.get("dof_frictionloss", np.zeros((1, 0))).any(0)
+        for d in np.flatnonzero(rubbed).tolist():
+            if ("dof_solref", (d, 0)) not in self._before:
+                self._follow(d)
+
+    def _follow(self, dof: int) -> None:
+        """Let dry friction follow the velocity where there is none, and nobody has said how."""
+        models = self._models
+        free = self._own["dof_frictionloss"][dof] == 0
+        free &= models.read("dof_solref", (dof, 0)) == DEFAULT
         for (field, column), value in reference(float(models.model.opt.timestep)).items():
-            entry = field, (d, *column)
-            before[entry] = models.read(*entry)
-            models.write(*entry, np.where(own == 0, value, before[entry]))
-    return before
+            entry = field, (dof, *column)
+            self._before[entry] = models.read(*entry)
+            models.write(*entry, np.where(free, value, self._before[entry]))
+
+    def restore(self) -> None:
+        """Set what was there before."""
+        entries = {(f, (d,)): v for f, own in self._own.items() for d, v in enumerate(own)}
+        for entry, value in (entries | self._before).items():
+            if not np.array_equal(self._models.read(*entry), value):
+                self._models.write(*entry, value)
 
 
 def steps_with(
@@ -108,7 +127,7 @@ def steps_with(
 ) -> None:
     """Step one simulation ``count`` times under its present controls, with additions each time."""
     control, applied = data.ctrl.copy(), data.qfrc_applied.copy()
-    base = {field: getattr(model, field).copy() for field in {*_FIELDS, *OF_FRICTION}}
+    base = {field: getattr(model, field).copy() for field in {*_FIELDS, *dry_friction.FIELDS}}
     followed = False
     try:
         for _ in range(count):

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 __all__ = ["MujocoPhysics"]
 
+import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDictBase
@@ -24,7 +25,7 @@ from torchrl.envs import EnvBase
 from ..errors import message
 from .assignments import Assignments, assignments
 from .consequences import DERIVED_FROM
-from .model_fields import resolve
+from .model_fields import Entries, resolve
 from .mujoco_models import MujocoModels, models_of
 
 _UNITS = {
@@ -84,6 +85,14 @@ class MujocoPhysics:
         """The fields of the model whose entries are set, such as ``body_mass``."""
         return frozenset(_field(target) for group in self._targets for target in group)
 
+    def entries(self, model: mujoco.MjModel) -> list[list[Entries]]:
+        """Return the entries of a model that each parameter sets.
+
+        Raises:
+            PhysicsError: The model has no such entry.
+        """
+        return [[resolve(model, target) for target in group] for group in self._targets]
+
     @property
     def units(self) -> tuple[str, ...]:
         """The parameters' SI units, of hinges for joints; empty where they depend on the model."""
@@ -122,7 +131,7 @@ class MujocoPhysics:
         models = models_of(env)
         known = models.resolved.get(self._targets)
         if known is None:
-            groups = [[resolve(models.model, t) for t in group] for group in self._targets]
+            groups = self.entries(models.model)
             known = models.resolved[self._targets] = assignments(models, groups)
         return models, known
 
