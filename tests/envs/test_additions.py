@@ -60,9 +60,8 @@ def test_friction_and_damping_are_added_to_what_each_simulation_has():
     stepper = Stepper(sledge(), 2, threads=1)
     stepper.models.write("dof_frictionloss", (0,), np.array([0.0, 2.0]))
     outputs = rollout_with(stepper, [resist], np.full((2, 1, 1), 2.5), substeps=1)
-    # under 2.5 N the first begins to slide, and half of that is friction: of 1 N, which follows the
-    # velocity; 3 N hold the second, but for the tenth of the motion that the constraint, which is
-    # its own and soft, lets through (solimp 0.9)
+    # under 2.5 N the first slides with 1 N of friction; 3 N hold the second, but for the tenth of
+    # the motion that the constraint, which is its own and soft, lets through (solimp 0.9)
     assert outputs[0, 0, 1] == pytest.approx((2.5 - 1.0) / 2 * 0.01, rel=0.05)
     assert outputs[1, 0, 1] == pytest.approx(0.1 * 2.5 / 2 * 0.01, rel=0.05)
     np.testing.assert_array_equal(stepper.models.read("dof_frictionloss", (0,)), [0.0, 2.0])

@@ -234,7 +234,7 @@ class LoadDependentFriction(ForceEffect):
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
         """Return the speed of a soft beginning, up to a tenth of the largest, or to that it has."""
         most = max(0.1 * reach.velocity, _ONSET, self.onset)
-        return {"onset": (max(_SHARP, 0.05 * self.onset), 0.0, most)}
+        return {"onset": (max(4 * _SHARP, 0.05 * self.onset), 0.0, most)}
 
     def targets(self, robot: Robot) -> tuple[str, ...]:
         """Return the names of the joints, none if no actuator moves one."""

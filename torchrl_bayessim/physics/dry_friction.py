@@ -8,16 +8,16 @@ force is that of Coulomb's law with the acceleration beside the velocity ::
 
 With its defaults (a time constant of 20 ms, so that ``b`` is 105 /s, and ``d`` 0.9) friction turns
 round where ``v = −v̇ / b``: 10 ms before the joint does. A joint that is driven to and fro is then
-off by several times what a good encoder's noise is, however small the time step. With ``d`` 0.5
+off by several times what a good encoder's noise is, however small the time step. With ``d`` 0.7
 and a reference that would stop the joint within one time step ``h``, ``b = 1 / (d h)``, friction
-turns round within ``d h``. What sticks creeps at up to ``s (1 − d) h / J``, half of what friction
-changes of the velocity in one time step: less than by default under time steps below 2 ms, more
-above. Larger ``d`` creep less and turn round earlier: under Euler's method at 10 ms there is little
-to choose, under the method of Runge and Kutta 0.5 is four times nearer to Coulomb's law than 0.9.
+turns round within ``d h``. What sticks creeps at up to ``s (1 − d) h / J``, a third of what
+friction changes of the velocity in one time step: less than by default under time steps below 3 ms,
+more above. Larger ``d`` creep less and turn round earlier: under the method of Runge and Kutta 0.5
+is nearer to Coulomb's law, under Euler's at 10 ms there is little to choose.
 
 Only where nobody has said how: degrees of freedom of which the model has no dry friction, and
 MuJoCo's default time constant. To have friction that was found in an MJCF, write ``frictionloss``
-with ``solreffriction="-1 -1/h"`` and ``solimpfriction="0.5 0.5"``.
+with ``solreffriction="-1 -1/h"`` and ``solimpfriction="0.7 0.7"``.
 
 Source: MuJoCo's documentation, Modeling, Solver parameters (``solreffriction`` in its direct
 format, ``solimpfriction``).
@@ -33,7 +33,7 @@ import mujoco
 import numpy as np
 
 Column = tuple[str, tuple[int, ...]]
-_IMPEDANCE = 0.5  # d
+_IMPEDANCE = 0.7  # d
 _DIRECT = ("dof_solref", (0,)), ("dof_solref", (1,))
 _IMPEDANCES = ("dof_solimp", (0,)), ("dof_solimp", (1,))
 DEFAULT = 0.02  # s, the time constant that a model has if nobody has said another
@@ -46,7 +46,7 @@ def reference(timestep: float) -> Mapping[Column, float]:
 
     Example:
         >>> list(reference(0.002).values())
-        [-1.0, -500.0, 0.5, 0.5]
+        [-1.0, -500.0, 0.7, 0.7]
     """
     # stiffness acts on a position that friction has not; MuJoCo divides the damping by d
     damping = dict(zip(_DIRECT, (-1.0, -1.0 / timestep), strict=True))
