@@ -134,7 +134,7 @@ def test_a_block_at_rest_on_a_plane_lacks_nothing():
 
 @pytest.mark.parametrize("first", [0, pytest.param(10, marks=pytest.mark.slow)])
 def test_friction_of_a_contact_is_not_excluded(first):
-    logs = [recorded(first + k, friction=0.55)[0] for k in range(5)]
+    logs = [recorded(first + k, friction=0.55)[0] for k in range(8)]
     report = diagnose(system(), None, logs, effects=EFFECTS)
     assert report.verdict in {"named", "named_partial", "ambiguous"}
     assert "contact_friction" in report.confusion_set

@@ -31,6 +31,7 @@ ELSEWHERE = {
     "BatchedMujocoEnv.meanwhile": "called by next_batch: tests/test_overlapped.py",
     "AttributePhysics.read": "called by ApplyPhysics",
     "MujocoPhysics.read": "called by ApplyPhysics",
+    "MujocoPhysics.entries": "takes a model of MuJoCo's: tests/physics/test_dry_friction.py",
     "StatePhysics.read": "called by ApplyPhysics",
     "StatePhysics.write": "called by ApplyPhysics",
 }
