@@ -68,13 +68,15 @@ class CoulombFriction(_Joint):
 
     def write(self, fields: Fields, strength: Tensor, robot: Robot) -> None:
         """Add to the joints' dry friction, which follows the velocity where there was none."""
-        steps, indices = fields["opt.timestep", ()], self._indices(robot)
-        known = reference(float(steps.flatten()[0]))
+        indices = self._indices(robot)
         free = [fields[self.field, (dof,)] == 0 for dof in indices]
         super().write(fields, strength, robot)
         for j, dof in enumerate(indices):
             new = free[j] & (strength[..., j] != 0) & (fields["dof_solref", (dof, 0)] == DEFAULT)
-            for (name, column), value in known.items() if new.any() else ():
+            if not new.any():  # a replay's model has all its joints follow
+                continue
+            timestep = float(fields["opt.timestep", ()].flatten()[0])
+            for (name, column), value in reference(timestep).items():
                 entry = name, (dof, *column)
                 fields[entry] = torch.where(new, value, fields[entry])
 

@@ -20,15 +20,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..physics import dry_friction
-from ..physics.dry_friction import DEFAULT, follow_velocity, reference
+from ..physics.dry_friction import DEFAULT, FIELDS, follow_velocity, reference
 from .bias_forces import BeforeStep, BiasForces, bias_force
 from .held_command import HeldCommand
 from .model_batch import ModelBatch
 from .stepper import Stepper
 
 Addition = Callable[[BeforeStep], Mapping[str, Tensor]]
-_FIELDS = "dof_frictionloss", "dof_damping"
+_ADDED = "dof_frictionloss", "dof_damping"
 _Array = NDArray[np.float64]
 _Entry = tuple[str, tuple[int, ...]]
 
@@ -91,7 +90,7 @@ class _Resistance:
     def __init__(self, models: ModelBatch) -> None:
         self._models = models
         dofs = range(models.model.nv)
-        self._own = {f: [models.read(f, (d,)) for d in dofs] for f in _FIELDS}
+        self._own = {f: [models.read(f, (d,)) for d in dofs] for f in _ADDED}
         self._before: dict[_Entry, _Array] = {}
 
     def add(self, added: Mapping[str, _Array]) -> None:
@@ -127,7 +126,7 @@ def steps_with(
 ) -> None:
     """Step one simulation ``count`` times under its present controls, with additions each time."""
     control, applied = data.ctrl.copy(), data.qfrc_applied.copy()
-    base = {field: getattr(model, field).copy() for field in {*_FIELDS, *dry_friction.FIELDS}}
+    base = {field: getattr(model, field).copy() for field in {*_ADDED, *FIELDS}}
     followed = False
     try:
         for _ in range(count):
@@ -141,7 +140,7 @@ def steps_with(
             if "dof_frictionloss" in added and not followed:
                 follow_velocity(model)
                 followed = True
-            for field in _FIELDS:
+            for field in _ADDED:
                 getattr(model, field)[:] = base[field] + added.get(field, 0.0)
             mujoco.mj_step(model, data)
     finally:
