@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from ..physics.dry_friction import DEFAULT, reference
+from ..physics.dry_friction import may_follow, reference
 from .effect import Effect, Fields, ModelEffect, Reach
 from .friction import PowerLawFriction, PreslidingFriction
 from .laws import within
@@ -69,10 +69,10 @@ class CoulombFriction(_Joint):
     def write(self, fields: Fields, strength: Tensor, robot: Robot) -> None:
         """Add to the joints' dry friction, which follows the velocity where there was none."""
         indices = self._indices(robot)
-        free = [fields[self.field, (dof,)] == 0 for dof in indices]
+        free = [may_follow(fields[self.field, (d,)], fields["dof_solref", (d, 0)]) for d in indices]
         super().write(fields, strength, robot)
         for j, dof in enumerate(indices):
-            new = free[j] & (strength[..., j] != 0) & (fields["dof_solref", (dof, 0)] == DEFAULT)
+            new = free[j] & (strength[..., j] != 0)
             if not new.any():  # a replay's model has all its joints follow
                 continue
             timestep = float(fields["opt.timestep", ()].flatten()[0])

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..physics.dry_friction import DEFAULT, FIELDS, follow_velocity, reference
+from ..physics.dry_friction import FIELDS, follow_velocity, may_follow, reference
 from .bias_forces import BeforeStep, BiasForces, bias_force
 from .held_command import HeldCommand
 from .model_batch import ModelBatch
@@ -106,8 +106,8 @@ class _Resistance:
     def _follow(self, dof: int) -> None:
         """Let dry friction follow the velocity where there is none, and nobody has said how."""
         models = self._models
-        free = self._own["dof_frictionloss"][dof] == 0
-        free &= models.read("dof_solref", (dof, 0)) == DEFAULT
+        own = self._own["dof_frictionloss"][dof]
+        free = may_follow(own, models.read("dof_solref", (dof, 0)))
         for (field, column), value in reference(float(models.model.opt.timestep)).items():
             entry = field, (dof, *column)
             self._before[entry] = models.read(*entry)

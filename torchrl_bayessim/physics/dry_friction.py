@@ -25,20 +25,40 @@ format, ``solimpfriction``).
 
 from __future__ import annotations
 
-__all__ = ["DEFAULT", "FIELDS", "follow_velocity", "reference"]
+__all__ = ["FIELDS", "follow_velocity", "may_follow", "reference"]
 
 from collections.abc import Collection, Mapping
+from typing import TypeVar
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
 
 Column = tuple[str, tuple[int, ...]]
 _IMPEDANCE = 0.7  # d
 _DIRECT = ("dof_solref", (0,)), ("dof_solref", (1,))
 _IMPEDANCES = ("dof_solimp", (0,)), ("dof_solimp", (1,))
-DEFAULT = 0.02  # s, the time constant that a model has if nobody has said another
+_DEFAULT = 0.02  # s, the time constant that a model has if nobody has said another
 FIELDS = frozenset({"dof_frictionloss", "dof_solref", "dof_solimp"})
 """Fields of a model that dry friction in joints depends on."""
+
+
+_A = TypeVar("_A", NDArray[np.float64], Tensor)
+
+
+def may_follow(frictionloss: _A, time_constant: _A) -> _A:
+    """Return where added dry friction may follow: there is none, and nobody has said how.
+
+    Args:
+        frictionloss: ``dof_frictionloss`` before anything is added, of any shape.
+        time_constant: The first column of ``dof_solref``, likewise.
+
+    Example:
+        >>> may_follow(np.array([0.0, 0.1, 0.0]), np.array([0.02, 0.02, -1.0])).tolist()
+        [True, False, False]
+    """
+    return (frictionloss == 0) & (time_constant == _DEFAULT)  # type: ignore[return-value]
 
 
 def reference(timestep: float) -> Mapping[Column, float]:
@@ -67,7 +87,7 @@ def follow_velocity(model: mujoco.MjModel, *, but: Collection[int] = ()) -> None
         >>> model.dof_solref.tolist()
         [[-1.0, -500.0]]
     """
-    free = (model.dof_frictionloss == 0) & (model.dof_solref[:, 0] == DEFAULT)
+    free = may_follow(model.dof_frictionloss, model.dof_solref[:, 0])
     free &= ~np.isin(np.arange(model.nv), list(but))
     for (field, column), value in reference(float(model.opt.timestep)).items():
         getattr(model, field)[free, column[0]] = value
