@@ -57,6 +57,7 @@ class Begun(Scripted):
         ([PAYLOAD], 700.0, False),  # a law in another form may leave as much
         ([PAYLOAD, C], 700.0, True),
         ([PAYLOAD, C], 450.0, False),
+        ([PAYLOAD, C, WAVE], 405.0, True),  # three effects explain no more than two
         ([], 900.0, False),
     ],
 )
@@ -72,6 +73,13 @@ def test_where_more_than_noise_is_left_a_search_goes_on_from_what_explains_less(
     assert search.or_two_others(before) is (two if taken else before)
     assert search.begun == [SPRING, ROTOR, A][: 3 * taken]
     assert search.units == ([SPRING] if taken else [PAYLOAD])
+
+
+def test_three_effects_that_explain_more_than_two_stay():
+    before = plain([PAYLOAD, C, WAVE], 385.0)
+    search = Begun(before, {SPRING: plain([SPRING, ROTOR], 410.0)})
+    assert search.or_two_others(before) is before
+    assert search.begun == [SPRING]
 
 
 @pytest.mark.parametrize("others", [[plain([SPRING, ROTOR], 470.0)], [

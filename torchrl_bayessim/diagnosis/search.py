@@ -49,6 +49,7 @@ _MOST = 4  # effects in one explanation
 _LESS, _FORMS = 0.05, 3  # of what is explained; models that explain all but that
 _MUCH = 1.5  # mean squared innovation: a law with a corner may leave as much of a soft one
 _ROUGH, _BEGINNINGS = 2.0, 5  # mean squared innovation of what two may explain; others tried
+_PAIR = 2  # effects
 MANY = 150  # effects at their places, of which another round takes too long
 _UNSEEN = 1.0  # a deviance, in units of the dispersion, that no test can detect
 
@@ -123,22 +124,36 @@ class Search:
 
         The effect that explains most alone may be neither of them: a spring beside a heavier rotor
         is nearly a payload. So a search that began anew goes on from what explains less alone, too.
+        Where three or more effects were found, two that explain as much for their price will do.
         """
-        rough = _ROUGH if len(best.names) == 1 else WHITE  # a law may have another form
-        many = len(self.offered) > MANY
-        if self.again is not None or many or not best.units or best.mean_square < rough:
+        if not self._may_be_two_others(best):
             return best
         others = [m for m in self.tried if len(m.names) == 1 and not m.names & best.names]
         begun = list(best_by_effect(others, self.start).values())[:_BEGINNINGS]
         tried = list(self.tried)
-        found = [two for two in map(self._two, begun) if two is not None and takes_most(best, two)]
-        found = [two for two in found if shown(best, two)]
+        found = [
+            two for two in map(self._two, begun) if two is not None and self._instead(best, two)
+        ]
         two = min(found, key=lambda two: criterion(two, 1.0), default=best)
         if two is best or any(as_good(two, other) for other in found if other is not two):
             self.tried[:] = tried
             return best
         self.units = self.offered
         return two
+
+    def _may_be_two_others(self, best: Model) -> bool:
+        """Return whether more than noise is left, or more was found than two effects."""
+        if self.again is not None or len(self.offered) > MANY or not best.units:
+            return False
+        rough = _ROUGH if len(best.names) == 1 else WHITE  # a law may have another form
+        return len(best.names) > _PAIR or best.mean_square >= rough
+
+    def _instead(self, best: Model, two: Model) -> bool:
+        """Return whether two effects stand in the place of a model's."""
+        if takes_most(best, two) and shown(best, two):
+            return True
+        cost = partial(priced, offered=self.offered, dispersion=best.dispersion())
+        return len(best.names) > _PAIR and cost(two) < cost(best)
 
     def _two(self, one: Model) -> Model | None:
         """Return a model of an effect and a second one, if they leave noise alone."""
