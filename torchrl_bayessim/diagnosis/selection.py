@@ -26,6 +26,7 @@ from .objective import Objective, Point, Unit
 from .refit import Fit
 from .screening import Screen
 from .search import Search, exactly, with_forms_of
+from .weaker_places import at_weaker_places
 
 _AGAIN = 3  # steps of fits whose noise was another
 _EXCHANGES = 3  # of effects for others in their places
@@ -157,8 +158,9 @@ def _settled(search: Search, best: Model) -> tuple[Model, dict[str, tuple[Model,
             break
         search.progress("trying others in its place")
         others = instead(best, tried=search.tried)
-        search.tried += [model for models in others.values() for model in models]
-        better = exchanged(search.start, best, others, search.offered)
+        apart = at_weaker_places(search.sets, best, with_forms_of(search.units, best))
+        search.tried += [*apart, *(model for models in others.values() for model in models)]
+        better = exchanged(search.start, best, {**others, "weaker places": apart}, search.offered)
         if better is best or exchanges == _EXCHANGES:
             return best, others
         best, dropped = eliminated(*search.sets, exactly(*search.sets, better))
