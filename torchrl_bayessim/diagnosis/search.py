@@ -2,8 +2,8 @@
 
 A round screens all units beside the model that there is, fits what may be added, and keeps what is
 worth it; in the end every unit has to show that the model needs it, and what is found beside less
-than a round had counts too. Where that leaves more than noise, two effects are looked for of which
-neither explains most alone.
+than a round had counts too. Where that leaves more than noise, or is more than two effects, two are
+looked for of which neither explains most alone.
 """
 
 from __future__ import annotations
