@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from plain_models import A, C, Unit, plain
+from plain_models import A, B, C, Unit, plain
 from test_diagnose import ARM, logs, system
 from test_search import Scripted
 
@@ -75,11 +75,17 @@ def test_where_more_than_noise_is_left_a_search_goes_on_from_what_explains_less(
     assert search.units == ([SPRING] if taken else [PAYLOAD])
 
 
-def test_three_effects_that_explain_more_than_two_stay():
-    before = plain([PAYLOAD, C, WAVE], 385.0)
-    search = Begun(before, {SPRING: plain([SPRING, ROTOR], 410.0)})
+@pytest.mark.parametrize(("left", "pairs"), [
+    (385.0, [410.0]),  # the three explain more
+    (300.0, [314.5]),  # less than noise, of which two "take most" whatever they do
+    (405.0, [410.0, 411.5]),  # another two do as well, though they cost more than the three
+])  # fmt: skip
+def test_three_effects_stay_if_two_cost_more_or_another_two_do_as_well(left, pairs):
+    before = plain([PAYLOAD, C, WAVE], left)
+    others = [plain(units, p) for units, p in zip(([SPRING, ROTOR], [A, B]), pairs, strict=False)]
+    search = Begun(before, dict(zip((SPRING, A), others, strict=False)))
     assert search.or_two_others(before) is before
-    assert search.begun == [SPRING]
+    assert search.begun == [SPRING, A][: len(pairs)]
 
 
 @pytest.mark.parametrize("others", [[plain([SPRING, ROTOR], 470.0)], [

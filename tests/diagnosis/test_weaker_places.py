@@ -1,5 +1,7 @@
 """Friction at two joints, at one of which it stands for another cause."""
 
+from functools import partial
+
 import mujoco
 import numpy as np
 import pytest
@@ -8,7 +10,9 @@ import torch
 from torchrl_bayessim.diagnosis.model import LIKELY, judged_fits
 from torchrl_bayessim.diagnosis.objective import Point, units_of
 from torchrl_bayessim.diagnosis.preparation import prepare
-from torchrl_bayessim.diagnosis.weaker_places import at_weaker_places
+from torchrl_bayessim.diagnosis.search import Search
+from torchrl_bayessim.diagnosis.selection import select
+from torchrl_bayessim.diagnosis.weaker_places import without_weaker_places
 from torchrl_bayessim.effects.catalogue import effect
 from torchrl_bayessim.envs.task import Task
 from torchrl_bayessim.inference.priors import BoxPrior
@@ -53,36 +57,52 @@ def run(rng, friction, gain, *, steps=150):
     )  # fmt: skip
 
 
-def fitted(friction, gain):
-    """Return sets of segments, units, and a model with friction at both joints."""
+NAMES = "coulomb_friction", "action_gain", "parallel_spring", "constant_force"
+
+
+def robot_and_logs(friction, gain):
     rng = np.random.default_rng(0)
     task = Task(model=mujoco.MjModel.from_xml_string(TWO), frame_skip=8)
     system = System(task=task, physics=MujocoPhysics(*BOUNDS), prior=BoxPrior(BOUNDS))
-    logs = [run(rng, friction, gain) for _ in range(6)]
-    prepared = prepare(system, logs, [], generator=rng)
+    return system, [run(rng, friction, gain) for _ in range(6)]
+
+
+def fitted(friction, gain):
+    """Return sets of segments, units, and a model with friction at both joints."""
+    system, logs = robot_and_logs(friction, gain)
+    prepared = prepare(system, logs, [], generator=np.random.default_rng(0))
     sets = prepared.sets["train"], prepared.sets["validation"]
-    names = "coulomb_friction", "action_gain", "parallel_spring", "constant_force"
-    units = units_of([effect(name) for name in names], system.robot)
-    both = {
-        u: 0.1 for u in units if u.name == "coulomb_friction" and u.where in system.robot.joints
-    }
-    assert len(both) == 2
+    units = units_of([effect(name) for name in NAMES], system.robot)
+    dry = [u for u in units if u.name == "coulomb_friction" and u.where in {"shoulder", "elbow"}]
+    both = dict.fromkeys(dry, 0.1)
     return sets, units, judged_fits(*sets, [Point(prepared.nominal.point.z, both)])[0]
+
+
+TRUE = {("coulomb_friction", "elbow"), ("action_gain", "first")}
 
 
 def test_a_gain_stands_in_for_friction_at_the_joint_where_it_has_little_to_do():
     sets, units, best = fitted([0.0, 0.3], 0.97)
-    found = at_weaker_places(sets, best, units)
-    first, *others = sorted(found, key=lambda m: m.deviances().sum())
-    assert {(u.name, u.where) for u in first.units} == {
-        ("coulomb_friction", "elbow"), ("action_gain", "first"),
-    }  # fmt: skip
-    assert best.deviances().sum() - first.deviances().sum() > LIKELY
-    strengths = {unit.name: s for unit, s in first.fit.point.strengths.items()}
+    assert {unit.name for unit in best.units} == {"coulomb_friction"}
+    found = without_weaker_places(sets, best, units, units)
+    assert {(u.name, u.where) for u in found.units} == TRUE
+    assert best.deviances().sum() - found.deviances().sum() > LIKELY
+    strengths = {unit.name: s for unit, s in found.fit.point.strengths.items()}
     assert strengths["action_gain"] == pytest.approx(-0.03, abs=0.01)
-    assert all(len(model.units) == 2 for model in others)
 
 
-def test_friction_that_is_at_both_joints_is_not_touched():
-    sets, units, best = fitted([0.2, 0.3], 1.0)
-    assert at_weaker_places(sets, best, units) == []
+@pytest.mark.parametrize("friction", [[0.2, 0.3], [0.02, 0.3]])
+def test_friction_that_is_at_both_joints_stays(friction):
+    sets, units, best = fitted(friction, 1.0)
+    assert without_weaker_places(sets, best, units, units) is best
+
+
+def test_a_search_looks_at_weaker_places_unless_what_varies_is_noise(monkeypatch):
+    sets, units, both = fitted([0.0, 0.3], 0.97)
+    start = judged_fits(*sets, [Point(both.fit.point.z, {})])[0]
+    monkeypatch.setattr(Search, "best", lambda self: self.screens.append(None) or both)
+    monkeypatch.setattr("torchrl_bayessim.diagnosis.selection.alternatives", lambda *_, **__: {})
+    chosen = partial(select, *sets, start.fit, units, pairs=False)
+    found = chosen(generator=np.random.default_rng(0)).best
+    assert {(u.name, u.where) for u in found.units} == TRUE
+    assert chosen(generator=np.random.default_rng(0), varied=True).best is both

@@ -120,22 +120,21 @@ class Search:
         return best
 
     def or_two_others(self, best: Model) -> Model:
-        """Return the model, or one of two effects that leave noise alone where its own do not.
+        """Return the model, or one of two effects that leave noise alone and stand in its place.
 
         The effect that explains most alone may be neither of them: a spring beside a heavier rotor
         is nearly a payload. So a search that began anew goes on from what explains less alone, too.
-        Where three or more effects were found, two that explain as much for their price will do.
+        Three or more effects give way to two that cost less, with a price for each number.
         """
         if not self._may_be_two_others(best):
             return best
         others = [m for m in self.tried if len(m.names) == 1 and not m.names & best.names]
         begun = list(best_by_effect(others, self.start).values())[:_BEGINNINGS]
         tried = list(self.tried)
-        found = [
-            two for two in map(self._two, begun) if two is not None and self._instead(best, two)
-        ]
+        pairs = [two for two in map(self._two, begun) if two is not None]
+        found = [two for two in pairs if self._instead(best, two)]
         two = min(found, key=lambda two: criterion(two, 1.0), default=best)
-        if two is best or any(as_good(two, other) for other in found if other is not two):
+        if two is best or any(as_good(two, other) for other in pairs if other is not two):
             self.tried[:] = tried
             return best
         self.units = self.offered
@@ -150,7 +149,7 @@ class Search:
 
     def _instead(self, best: Model, two: Model) -> bool:
         """Return whether two effects stand in the place of a model's."""
-        if takes_most(best, two) and shown(best, two):
+        if best.mean_square >= WHITE and takes_most(best, two) and shown(best, two):
             return True
         cost = partial(priced, offered=self.offered, dispersion=best.dispersion())
         return len(best.names) > _PAIR and cost(two) < cost(best)

@@ -25,8 +25,8 @@ from .model import LIKELY, Model, judged, judged_fits
 from .objective import Objective, Point, Unit
 from .refit import Fit
 from .screening import Screen
-from .search import Search, exactly, with_forms_of
-from .weaker_places import at_weaker_places
+from .search import MANY, Search, exactly, with_forms_of
+from .weaker_places import without_weaker_places
 
 _AGAIN = 3  # steps of fits whose noise was another
 _EXCHANGES = 3  # of effects for others in their places
@@ -115,7 +115,7 @@ def select(
         known: What was found before, with another noise: the search goes on from there.
         varied: Whether what varies counts as noise: less than white noise may still hold an effect.
         pairs: Whether to look for two effects of which neither explains most alone, where more than
-            noise is left.
+            noise is left, or three or more are found.
         shapes: Returns those among them that have a frequency or a step, as they are seen beside
             what is in the model already.
         alpha: Level of the test that anything is missing, in every round.
@@ -158,9 +158,12 @@ def _settled(search: Search, best: Model) -> tuple[Model, dict[str, tuple[Model,
             break
         search.progress("trying others in its place")
         others = instead(best, tried=search.tried)
-        apart = at_weaker_places(search.sets, best, with_forms_of(search.units, best))
-        search.tried += [*apart, *(model for models in others.values() for model in models)]
-        better = exchanged(search.start, best, {**others, "weaker places": apart}, search.offered)
+        search.tried += [model for models in others.values() for model in models]
+        better = exchanged(search.start, best, others, search.offered)
+        # where what varies counts as noise, any effect mends a little of it
+        if better is best and not search.varied and len(search.offered) <= MANY:
+            units = with_forms_of(search.units, best)
+            better = without_weaker_places(search.sets, best, units, search.offered)
         if better is best or exchanges == _EXCHANGES:
             return best, others
         best, dropped = eliminated(*search.sets, exactly(*search.sets, better))

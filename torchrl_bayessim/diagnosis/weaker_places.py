@@ -1,4 +1,4 @@
-"""Another effect in the place of one at the weaker of its places.
+"""Another effect in the place of one at the weakest of its places.
 
 A round takes in an effect at all places that together explain most. Where one of them has little to
 do, it may be a stopgap: friction of a pole's pivot and a little of the cart's rail may be friction
@@ -7,13 +7,16 @@ of the pivot alone, and a battery that sags.
 
 from __future__ import annotations
 
-__all__ = ["at_weaker_places"]
+__all__ = ["without_weaker_places"]
 
+import math
 from collections.abc import Sequence
+from functools import partial
 
 from ..effects.effect import Effect
 from .explanations import compare
-from .model import Model, judged_fits
+from .free_numbers import priced
+from .model import LIKELY, WHITE, Model, judged_fits, shown
 from .objective import Objective, Point, Unit
 
 _WEAK = 0.05  # of the deviance that the same effect explains at its strongest place
@@ -21,23 +24,32 @@ _PLACES = 4  # of one effect: beyond, each is one of many of a kind
 _RIVALS = 6  # effects that are tried in the place of one
 
 
-def at_weaker_places(
-    sets: tuple[Objective, Objective], best: Model, units: Sequence[Unit]
-) -> list[Model]:
-    """Return models with another effect at the weaker places of each effect that is at several.
+def without_weaker_places(
+    sets: tuple[Objective, Objective],
+    best: Model,
+    units: Sequence[Unit],
+    offered: Sequence[Unit],
+) -> Model:
+    """Return the best of a model and those with another effect at the weakest place of one of its.
+
+    That has to leave noise alone, to show beside the others, and to explain more than chance would.
 
     Args:
         sets: Where models are fitted, and where they are judged.
         best: The model.
         units: The effects to consider.
+        offered: The effects as they were offered: numbers that were fitted have their price.
     """
-    found = []
+    cost = partial(priced, offered=offered, dispersion=best.dispersion())
+    found = [best]
     for name in best.names:
         mine = [unit for unit in best.units if unit.name == name]
-        if 1 < len(mine) <= _PLACES:
-            for weaker in _weaker(best, judged_fits(*sets, [_without(best, u) for u in mine])):
-                found += _others(sets, best, weaker, units)
-    return found
+        places = {unit.where for unit in mine}
+        if 1 < len(mine) == len(places) <= _PLACES:
+            smaller = judged_fits(*sets, [_without(best, unit) for unit in mine])
+            found += _others(sets, best, _without_weakest(best, smaller), units)
+    first = min(found, key=cost)
+    return first if cost(best) - cost(first) > LIKELY else best
 
 
 def _without(best: Model, out: Unit) -> Point:
@@ -45,17 +57,20 @@ def _without(best: Model, out: Unit) -> Point:
     return Point(best.fit.point.z, {unit: s for unit, s in strengths.items() if unit != out})
 
 
-def _weaker(best: Model, smaller: Sequence[Model]) -> list[Model]:
-    """Return the models without a place that has little to do, of those without each."""
+def _without_weakest(best: Model, smaller: Sequence[Model]) -> Model | None:
+    """Return the model without the place that has least to do, of those without each, if little."""
     total = float(best.deviances().sum())
-    lost = [float(model.deviances().sum()) - total for model in smaller]
-    return [m for m, loss in zip(smaller, lost, strict=True) if loss < _WEAK * max(lost)]
+    lost = {float(model.deviances().sum()) - total: model for model in smaller}
+    least, most = min(lost), max(lost)
+    return lost[least] if math.isfinite(most) and least < _WEAK * most else None
 
 
 def _others(
-    sets: tuple[Objective, Objective], best: Model, weaker: Model, units: Sequence[Unit]
+    sets: tuple[Objective, Objective], best: Model, weaker: Model | None, units: Sequence[Unit]
 ) -> list[Model]:
     """Return the model without a place, with each of the effects that show most beside it."""
+    if weaker is None:
+        return []
     names = best.names
     left = [unit for unit in units if unit.name not in names]
     first: dict[Effect, tuple[Unit, float]] = {}
@@ -63,4 +78,5 @@ def _others(
         if len(first) < _RIVALS:
             first.setdefault(unit.effect, (unit, strength))
     starts = [weaker.fit.point.beside({unit: strength}) for unit, strength in first.values()]
-    return judged_fits(*sets, starts, race=best.fit.cost) if starts else []
+    models = judged_fits(*sets, starts, race=best.fit.cost) if starts else []
+    return [m for m in models if m.mean_square < WHITE and shown(weaker, m)]
