@@ -17,7 +17,7 @@ from ..effects.effect import Effect
 from .explanations import compare
 from .free_numbers import priced
 from .model import LIKELY, WHITE, Model, judged_fits, shown
-from .objective import Objective, Point, Unit
+from .objective import Objective, Unit
 
 _WEAK = 0.05  # of the deviance that the same effect explains at its strongest place
 _PLACES = 4  # of one effect: beyond, each is one of many of a kind
@@ -46,15 +46,11 @@ def without_weaker_places(
         mine = [unit for unit in best.units if unit.name == name]
         places = {unit.where for unit in mine}
         if 1 < len(mine) == len(places) <= _PLACES:
-            smaller = judged_fits(*sets, [_without(best, unit) for unit in mine])
-            found += _others(sets, best, _without_weakest(best, smaller), units)
+            smaller = judged_fits(*sets, [best.fit.without(unit).point for unit in mine])
+            weaker = _without_weakest(best, smaller)
+            found += [] if weaker is None else _others(sets, best, weaker, units)
     first = min(found, key=cost)
     return first if cost(best) - cost(first) > LIKELY else best
-
-
-def _without(best: Model, out: Unit) -> Point:
-    strengths = best.fit.point.strengths
-    return Point(best.fit.point.z, {unit: s for unit, s in strengths.items() if unit != out})
 
 
 def _without_weakest(best: Model, smaller: Sequence[Model]) -> Model | None:
@@ -66,11 +62,9 @@ def _without_weakest(best: Model, smaller: Sequence[Model]) -> Model | None:
 
 
 def _others(
-    sets: tuple[Objective, Objective], best: Model, weaker: Model | None, units: Sequence[Unit]
+    sets: tuple[Objective, Objective], best: Model, weaker: Model, units: Sequence[Unit]
 ) -> list[Model]:
     """Return the model without a place, with each of the effects that show most beside it."""
-    if weaker is None:
-        return []
     names = best.names
     left = [unit for unit in units if unit.name not in names]
     first: dict[Effect, tuple[Unit, float]] = {}
