@@ -66,6 +66,44 @@ def test_a_wheel_follows_the_differential_equation(way):
     assert np.abs(other - true.y[0]).max() > 0.02 * largest
 
 
+@pytest.mark.parametrize("speed", [0.2, 0.6])
+def test_a_wheel_whose_friction_fades_follows_the_differential_equation(speed):
+    way = 0.02
+
+    def torque(t):
+        return 1.2 * FRICTION * math.sin(5 * t) + 0.3 * math.sin(13 * t)
+
+    def rates(t, state):
+        _, v, z = state
+        level = way * math.exp(-((v / speed) ** 2))
+        bent = v - abs(v) * z / level if level > 1e-6 * way else -1e3 * z
+        return v, (torque(t) - FRICTION * z / way) / INERTIA, bent
+
+    seconds, dt = 1.0, 0.0005
+    ends = np.arange(1, round(seconds / dt) + 1) * dt
+    true = solve_ivp(
+        rates, (0, seconds), [0, 0, 0], t_eval=ends, rtol=1e-9, atol=1e-10, method="LSODA"
+    )
+    largest = np.abs(true.y[0]).max()
+    law = effect("stribeck_friction", speed=speed, presliding=way)
+    angles = turned(wheel(dt), [law], torque, seconds)
+    assert np.abs(angles - true.y[0]).max() < 0.01 * largest
+    other = turned(wheel(dt), [effect("stribeck_friction", speed=speed)], torque, seconds)
+    assert np.abs(other - true.y[0]).max() > 0.05 * largest
+
+
+def test_with_hardly_any_presliding_friction_that_fades_is_what_it_is_without():
+    def torque(t):
+        return 2 * FRICTION * math.sin(5 * t)
+
+    dry = turned(wheel(0.001), [effect("stribeck_friction")], torque, 2.0)
+    law = effect("stribeck_friction", presliding=1e-5)
+    angles = turned(wheel(0.001), [law], torque, 2.0)
+    assert np.abs(angles - dry).max() < 0.05 * np.ptp(dry)
+    with pytest.raises(ValueError, match="presliding, a way before friction slides"):
+        effect("stribeck_friction", presliding=-0.1)
+
+
 @pytest.mark.parametrize("dt", [0.001, 0.01])
 def test_with_hardly_any_presliding_it_is_dry_friction(dt):
     def torque(t):
@@ -94,8 +132,11 @@ def test_what_presliding_makes_of_the_name():
         effect("coulomb_friction", speed=1.0)
 
 
-def test_without_strength_it_is_nothing():
-    law, now = PreslidingFriction(), torch.tensor([[0.3], [0.0]]).double()
+@pytest.mark.parametrize(
+    "law", [PreslidingFriction(), effect("stribeck_friction", presliding=0.01)]
+)
+def test_without_strength_it_is_nothing(law):
+    now = torch.tensor([[0.3], [0.0]]).double()
     state = Readings(qpos=now, qvel=now, ctrl=now, time=now)
     forcing = Forcing(robot_of(Task(model=wheel(0.01), frame_skip=1)))
     active = [(law, torch.zeros(2, 1).double())]

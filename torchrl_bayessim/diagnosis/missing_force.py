@@ -55,7 +55,7 @@ def missing_forces(
         pushes: A constant force at each of ``J`` joints.
     """
     sizes = [_SIZE * unit.high for unit in pushes]
-    points = [point.beside({u: s}) for u, s in zip(pushes, sizes, strict=True)]
+    points = [point.more(u, s) for u, s in zip(pushes, sizes, strict=True)]
     innovations, *changed = objective([point, *points])
     slopes = (np.stack(changed) - innovations) / np.array(sizes)[:, None, None]
     normal = np.einsum("ism,jsm->sij", slopes, slopes)

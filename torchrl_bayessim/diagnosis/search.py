@@ -43,6 +43,7 @@ from .rounded_commands import rounded
 from .screening import Screen
 from .shapes import with_shapes
 from .wavering import waver
+from .waves_anew import with_waves_anew
 
 Array = NDArray[np.float64]
 _MOST = 4  # effects in one explanation
@@ -265,7 +266,8 @@ class Search:
         return all_of_little(self.start, best, models, train=train, left=left, missing=missing)
 
     def _needs(self, best: Model) -> Model:
-        """Return the model without the effects that it does not need."""
+        """Return the model without the effects that it does not need, its waves read off anew."""
+        best = with_waves_anew(self.sets, best, self.shapes, self.offered)
         self.progress("taking out what is not needed")
         needs, dropped = eliminated(*self.sets, best)
         if len(needs.units) < len(best.units):

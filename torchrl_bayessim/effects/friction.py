@@ -31,6 +31,7 @@ from .laws import within
 from .robot import Robot
 
 _PRESLIDING = 0.005  # rad or m
+_FADED = 1e-6  # of friction at rest: never quite nothing
 _ONSET = 0.1  # rad/s or m/s
 _SLOWEST = 1e-6  # of that
 _CREEP = 0.01  # rad/s or m/s
@@ -65,8 +66,7 @@ class PreslidingFriction(ForceEffect):
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
         """Return the way, up to a tenth of the robot's."""
-        most = max(0.1 * reach.position, 2 * _PRESLIDING)
-        return {"presliding": (0.05 * self.presliding, 0.1 * _PRESLIDING, most)}
+        return {"presliding": (0.05 * self.presliding, 0.1 * _PRESLIDING, _farthest(reach))}
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.3 ``F_max``."""
@@ -74,48 +74,103 @@ class PreslidingFriction(ForceEffect):
 
     def start(self, velocity: Tensor) -> Memory:
         """Return nothing known of the bristles: bent as if the joint had moved on and on."""
-        return {"bent": torch.full_like(velocity, torch.nan)}
+        return _unknown(velocity)
 
     def forces(
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
         """Return the bristles' force at the end of this time step."""
-        sign, stiffness = now.velocity.sign(), strength / self.presliding
-        slid = self.presliding * sign
-        before = filled(memory["bent"], slid)
-        left = torch.exp(-now.velocity.abs() * now.timestep / self.presliding)
-        after = slid + (before - slid) * left
-        # the derivative of k z by the speed
-        damping = stiffness * now.timestep * (1 - sign * before / self.presliding) * left
-        force = damping * now.velocity - stiffness * after
-        return {"force": force, "damping": damping}, {"bent": after}
+        return _bristles(strength, memory, now, presliding=self.presliding)
 
 
 class StribeckFriction(ForceEffect):
     """Dry friction that fades with speed: ``s e^{−(v/v_s)²}``; N m or N, up to 30 % of ``F_max``.
 
+    With presliding it gives way before it slides, as bristles that are bent by ``z`` do::
+
+        force −k z,  ż = v − |v| z / (z_s e^{−(v/v_s)²}),  k = s / z_s,
+
+    the law of Canudas de Wit, Olsson, Åström & Lischinsky, IEEE Transactions on Automatic Control
+    40 (1995), equations 1 to 4, with neither kinetic friction nor a damping of the bristles; solved
+    as that of `PreslidingFriction` is.
+
     Args:
-        speed: ``v_s``, rad/s or m/s.
+        speed: ``v_s``, rad/s or m/s. A diagnosis fits it.
+        presliding: ``z_s``, rad or m; 0 for none. A diagnosis fits it.
+
+    Raises:
+        ValueError: ``presliding`` is negative.
+
+    Example:
+        >>> StribeckFriction(presliding=0.004).form
+        {'speed': 0.2, 'presliding': 0.004}
     """
 
     name, unit, group = "stribeck_friction", "N m", "friction"
 
-    def __init__(self, speed: float = 0.2) -> None:
-        self.speed = speed
+    def __init__(self, speed: float = 0.2, presliding: float = 0.0) -> None:
+        check_number("presliding, a way before friction slides", presliding, least=0.0)
+        self.speed, self.presliding = speed, presliding
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
-        """Return the speed, up to a quarter of the largest: beyond it friction hardly fades."""
-        return {"speed": (0.05 * self.speed, 0.02, max(0.25 * reach.velocity, self.speed))}
+        """Return the speed, up to a quarter of the largest, and the way.
+
+        Beyond that speed friction hardly fades.
+        """
+        return {
+            "speed": (0.05 * self.speed, 0.02, max(0.25 * reach.velocity, self.speed)),
+            "presliding": (0.1 * _PRESLIDING, 0.0, _farthest(reach)),
+        }
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.3 ``F_max``."""
         return within(robot.force_scale, 0.0, 0.3)
 
+    def start(self, velocity: Tensor) -> Memory:
+        """Return nothing known of the bristles, if there are any."""
+        return _unknown(velocity) if self.presliding else {}
+
     def forces(
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
-        """Return the dry friction at this speed."""
-        return {"frictionloss": strength * torch.exp(-((now.velocity / self.speed) ** 2))}, memory
+        """Return the dry friction at this speed, or the bristles' force."""
+        level = torch.exp(-((now.velocity / self.speed) ** 2))
+        if not self.presliding:
+            return {"frictionloss": strength * level}, memory
+        level = level.clamp(min=_FADED)
+        return _bristles(strength, memory, now, presliding=self.presliding, level=level)
+
+
+def _unknown(velocity: Tensor) -> Memory:
+    return {"bent": torch.full_like(velocity, torch.nan)}
+
+
+def _farthest(reach: Reach) -> float:
+    """Return the longest way before friction slides, a tenth of the robot's."""
+    return max(0.1 * reach.position, 2 * _PRESLIDING)
+
+
+def _bristles(
+    strength: Tensor, memory: Memory, now: Now, *, presliding: float, level: Tensor | float = 1.0
+) -> tuple[Mapping[str, Tensor], Memory]:
+    """Return the force of bristles at the end of a time step, and how far they are bent by then.
+
+    Args:
+        strength: ``s``.
+        memory: How far they are bent at its beginning.
+        now: The time step.
+        presliding: ``z_s``, for friction that has not faded.
+        level: What is left of friction at this speed.
+    """
+    sign, stiffness, way = now.velocity.sign(), strength / presliding, presliding * level
+    slid = way * sign
+    before = filled(memory["bent"], slid)
+    left = torch.exp(-now.velocity.abs() * now.timestep / way)
+    after = slid + (before - slid) * left
+    # the derivative of k z by the speed; bristles that spring back as friction fades damp nothing
+    damping = stiffness * now.timestep * (1 - sign * before / way).clamp(min=0.0) * left
+    force = damping * now.velocity - stiffness * after
+    return {"force": force, "damping": damping}, {"bent": after}
 
 
 class _PowerLaw(ForceEffect):
