@@ -8,7 +8,7 @@ looked for of which neither explains most alone.
 
 from __future__ import annotations
 
-__all__ = ["MANY", "Search", "exactly", "with_forms_of"]
+__all__ = ["MANY", "Search", "with_forms_of"]
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -33,7 +33,6 @@ from .model import (
     best_by_effect,
     criterion,
     judged,
-    judged_fits,
     shown,
     takes_most,
 )
@@ -42,6 +41,7 @@ from .refit import Fit, refit
 from .rounded_commands import rounded
 from .screening import Screen
 from .shapes import with_shapes
+from .time_steps import exactly
 from .wavering import waver
 from .waves_anew import with_waves_anew
 
@@ -52,7 +52,6 @@ _MUCH = 1.5  # mean squared innovation: a law with a corner may leave as much of
 _ROUGH, _BEGINNINGS = 2.0, 5  # mean squared innovation of what two may explain; others tried
 _PAIR = 2  # effects
 MANY = 150  # effects at their places, of which another round takes too long
-_UNSEEN = 1.0  # a deviance, in units of the dispersion, that no test can detect
 
 
 class Search:
@@ -267,7 +266,10 @@ class Search:
 
     def _needs(self, best: Model) -> Model:
         """Return the model without the effects that it does not need, its waves read off anew."""
-        best = with_waves_anew(self.sets, best, self.shapes, self.offered)
+        if any(unit.effect.placed for unit in best.units):
+            self.progress("reading waves off anew")
+            best = with_waves_anew(self.sets, best, self.shapes, self.offered)
+            self.tried.append(best)
         self.progress("taking out what is not needed")
         needs, dropped = eliminated(*self.sets, best)
         if len(needs.units) < len(best.units):
@@ -312,33 +314,6 @@ def _beside(model: Model, found: Sequence[Unit]) -> list[Unit]:
     """Return those that the model does not have at their places already."""
     there = {(unit.name, unit.where) for unit in model.units}
     return [unit for unit in found if (unit.name, unit.where) not in there]
-
-
-def exactly(train: Objective, validation: Objective, model: Model) -> Model:
-    """Fit a model with forces that follow the state at each time step, as many as can be told.
-
-    Forces that are held for 10 ms lag, and what lags looks like a delay to the next round. Where
-    something is missing still, less of it can be told: deviances count by their dispersion.
-    """
-    own = train.predictor.system.task.frame_skip
-    if train.predictor.exact and train.predictor.substeps == own:
-        return model
-    tolerated = _UNSEEN * max(1.0, model.fit.mean_square)
-
-    def exact(substeps: int) -> Array:
-        other = train.predictor.divided(substeps)
-        other.exactly(substeps)
-        return train.on(other)([model.fit.point])[0]
-
-    true = exact(own)
-    if float(((true - model.fit.innovations) ** 2).sum()) < tolerated:
-        return model
-    fewer = (n for n in range(train.predictor.substeps, own) if own % n == 0)
-    near = (n for n in fewer if float(((true - exact(n)) ** 2).sum()) < tolerated)
-    substeps = next(near, own)
-    for predictor in {train.predictor, validation.predictor}:
-        predictor.exactly(substeps)
-    return judged_fits(train, validation, [model.fit.point], iterations=4)[0]
 
 
 def _p_value(seen: Screen, model: Model, generator: np.random.Generator) -> float:

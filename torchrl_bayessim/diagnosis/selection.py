@@ -25,7 +25,8 @@ from .model import LIKELY, Model, judged, judged_fits
 from .objective import Objective, Point, Unit
 from .refit import Fit
 from .screening import Screen
-from .search import MANY, Search, exactly, with_forms_of
+from .search import MANY, Search, with_forms_of
+from .time_steps import exactly
 from .weaker_places import without_weaker_places
 
 _AGAIN = 3  # steps of fits whose noise was another

@@ -1,19 +1,21 @@
 """As few time steps as the data allow: most of a search is simulation.
 
 An integrator of fourth order follows an arm with a quarter of the steps that its model asks for;
-one of first order, or contacts, do not forgive fewer. So it is tried, on the robot's own motion.
+one of first order, or contacts, do not forgive fewer. So it is tried, on the robot's own motion. A
+model that was found is fitted with as many as can be told.
 """
 
 from __future__ import annotations
 
-__all__ = ["with_fewest_steps"]
+__all__ = ["exactly", "with_fewest_steps"]
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .objective import Point, Unit, parameters_at, strengths_of
+from .model import Model, judged_fits
+from .objective import Objective, Point, Unit, parameters_at, strengths_of
 from .prediction import Predictor, fewest_parts
 from .segments import Segments
 
@@ -22,6 +24,7 @@ _UNSEEN = 0.02  # standard deviations of the noise
 _ALIKE = 0.1  # of what an effect does
 _TYPICAL = 0.1  # of its range
 _EVERY = 3  # so many segments one, for the effects
+_HIDDEN = 1.0  # a deviance, in units of the dispersion, that no test can detect
 
 
 def with_fewest_steps(
@@ -58,6 +61,33 @@ def with_fewest_steps(
         if (_size(predicted(other, points, segments.take(some)) - true) < tolerated).all():
             return other
     return predictor
+
+
+def exactly(train: Objective, validation: Objective, model: Model) -> Model:
+    """Fit a model with forces that follow the state at each time step, as many as can be told.
+
+    Forces that are held for 10 ms lag, and what lags looks like a delay to the next round. Where
+    something is missing still, less of it can be told: deviances count by their dispersion.
+    """
+    own = train.predictor.system.task.frame_skip
+    if train.predictor.exact and train.predictor.substeps == own:
+        return model
+    tolerated = _HIDDEN * max(1.0, model.fit.mean_square)
+
+    def exact(substeps: int) -> Array:
+        other = train.predictor.divided(substeps)
+        other.exactly(substeps)
+        return train.on(other)([model.fit.point])[0]
+
+    true = exact(own)
+    if float(((true - model.fit.innovations) ** 2).sum()) < tolerated:
+        return model
+    fewer = (n for n in range(train.predictor.substeps, own) if own % n == 0)
+    near = (n for n in fewer if float(((true - exact(n)) ** 2).sum()) < tolerated)
+    substeps = next(near, own)
+    for predictor in {train.predictor, validation.predictor}:
+        predictor.exactly(substeps)
+    return judged_fits(train, validation, [model.fit.point], iterations=4)[0]
 
 
 def _size(residual: Array) -> Array:
