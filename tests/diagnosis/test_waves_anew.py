@@ -53,3 +53,21 @@ def test_a_wave_stays_where_there_is_no_better_one(alone):
         wave = model.units[1]
         (model,) = judged_fits(*sets, [Point(model.fit.point.z, {wave: 0.1})])
     assert with_waves_anew(sets, model, seen if alone else lambda _: [], model.units) is model
+
+
+def test_of_several_waves_each_is_read_off_anew():
+    """The second is looked for where the first one's fit has left it."""
+    sets, seen, model = on_a_rail(1.3)
+    (magnets,) = units_of([effect("cogging", number=31.0, phase=0.0)], cart().robot)
+    point = model.fit.point.beside({magnets: 0.05})
+    (model,) = judged_fits(*sets, [point])
+    asked = []
+
+    def waves(point):
+        asked.append([unit.name for unit in point.strengths])
+        return seen(point) + units_of([effect("cogging", number=47.0)], cart().robot)
+
+    better = with_waves_anew(sets, model, waves, model.units)
+    assert better.fit.cost < model.fit.cost
+    assert {unit.name for unit in better.units} == {unit.name for unit in model.units}
+    assert asked[0] == ["constant_force", "cogging"]

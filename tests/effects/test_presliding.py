@@ -92,16 +92,35 @@ def test_a_wheel_whose_friction_fades_follows_the_differential_equation(speed):
     assert np.abs(other - true.y[0]).max() > 0.05 * largest
 
 
-def test_with_hardly_any_presliding_friction_that_fades_is_what_it_is_without():
+def test_ways_that_no_time_step_resolves_are_none():
+    assert effect("stribeck_friction", presliding=4e-4) == effect("stribeck_friction")
+    least = effect("stribeck_friction", presliding=5e-4)
+    assert least.form == {"speed": 0.2, "presliding": 5e-4}
+
     def torque(t):
         return 2 * FRICTION * math.sin(5 * t)
 
     dry = turned(wheel(0.001), [effect("stribeck_friction")], torque, 2.0)
-    law = effect("stribeck_friction", presliding=1e-5)
-    angles = turned(wheel(0.001), [law], torque, 2.0)
-    assert np.abs(angles - dry).max() < 0.05 * np.ptp(dry)
+    assert np.abs(turned(wheel(0.001), [least], torque, 2.0) - dry).max() < 0.05 * np.ptp(dry)
+
+
+def test_what_friction_that_fades_may_not_be():
     with pytest.raises(ValueError, match="presliding, a way before friction slides"):
         effect("stribeck_friction", presliding=-0.1)
+    with pytest.raises(ValueError, match="speed at which friction fades"):
+        effect("stribeck_friction", speed=0.0)
+
+
+def test_bristles_that_spring_back_as_friction_fades_do_not_drive_the_joint():
+    """Bent by all of the way at rest, and moving fast at once: negative damping otherwise."""
+    law, now = effect("stribeck_friction", presliding=0.01), torch.tensor([[0.3]]).double()
+    state = Readings(qpos=now, qvel=now, ctrl=now, time=now)
+    forcing = Forcing(robot_of(Task(model=wheel(0.001), frame_skip=1)))
+    active = [(law, torch.tensor([[FRICTION]]).double())]
+    added, (memory,) = forcing(active, [{"bent": torch.tensor([[0.01]]).double()}], state)
+    assert added["dof_damping"].item() == 0.0
+    assert added["qfrc_applied"].item() == pytest.approx(-FRICTION * memory["bent"].item() / 0.01)
+    assert 0.0 < memory["bent"].item() < 0.01
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.01])

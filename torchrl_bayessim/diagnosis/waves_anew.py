@@ -17,6 +17,7 @@ from .objective import Objective, Point, Unit
 from .refit import refit
 
 _STEPS = 4  # of fits without the wave
+_SAME = 0.02  # of a rate: a fit goes there by itself
 
 
 def with_waves_anew(
@@ -27,7 +28,8 @@ def with_waves_anew(
 ) -> Model:
     """Return the model with other waves in the place of its own, where those explain more.
 
-    Where noise alone is left, or there is nothing else in the model, the model itself.
+    Of several each in turn. Where noise alone is left, or nothing else is in the model, the model
+    itself.
 
     Args:
         sets: Where models are fitted, and where they are judged.
@@ -35,21 +37,40 @@ def with_waves_anew(
         shapes: Returns effects with a frequency or a step, as they are seen beside a model.
         offered: Units with effects as they were offered, of which no number has been fitted.
     """
-    if len(model.units) < 2 or model.mean_square < WHITE:
-        return model
-    for unit in (unit for unit in model.units if unit.effect.placed):
-        point = model.fit.point
-        others = {u: s for u, s in point.strengths.items() if u != unit}
-        base = refit(sets[0], [Point(point.z, others)], iterations=_STEPS)[0].point
-        seen = [u for u in shapes(base) if u.place == unit.place and u not in others]
-        starts = [
-            Point(base.z, {**base.strengths, wave: wave.inside(point.strengths[unit])})
-            for wave in seen
-        ]
-        found = judged_fits(*sets, starts) if starts else []
-        race = model.fit.cost
-        formed = [with_fitted_forms(*sets, other, offered, race=race) for other in found]
-        best = min(formed, key=lambda other: other.fit.cost, default=model)
-        if best.fit.cost < model.fit.cost - LIKELY * max(1.0, best.mean_square):
-            model = best
+    for place in [unit.place for unit in model.units if unit.effect.placed]:
+        if len(model.units) < 2 or model.mean_square < WHITE:
+            break
+        # a fit of the one before has moved this one's numbers, too
+        wave = next(unit for unit in model.units if unit.place == place)
+        other = _anew(sets, model, wave, shapes, offered=offered)
+        if other is not None:
+            model = other
     return model
+
+
+def _anew(
+    sets: tuple[Objective, Objective],
+    model: Model,
+    wave: Unit,
+    shapes: Callable[[Point], Sequence[Unit]],
+    *,
+    offered: Collection[Unit],
+) -> Model | None:
+    """Return the model with a wave of another rate that explains more, if there is one."""
+    point = model.fit.point
+    others = {unit: strength for unit, strength in point.strengths.items() if unit != wave}
+    base = refit(sets[0], [Point(point.z, others)], iterations=_STEPS)[0].point
+    seen = [u for u in shapes(base) if u.place == wave.place and not _same_rate(u, wave)]
+    starts = [base.beside({u: u.inside(point.strengths[wave])}) for u in seen]
+    found = judged_fits(*sets, starts) if starts else []
+    formed = [with_fitted_forms(*sets, m, offered, race=model.fit.cost) for m in found]
+    best = min(formed, key=lambda m: m.fit.cost, default=model)
+    gained = model.fit.cost - best.fit.cost
+    return best if gained > LIKELY * max(1.0, best.mean_square) else None
+
+
+def _same_rate(one: Unit, other: Unit) -> bool:
+    """Return whether two waves have the same frequency, or number, but for a few per cent."""
+    rate = one.effect.placed[0]
+    mine, others = one.effect.form[rate], other.effect.form[rate]
+    return abs(mine - others) < _SAME * others

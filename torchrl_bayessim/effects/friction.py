@@ -30,7 +30,7 @@ from .history import filled
 from .laws import within
 from .robot import Robot
 
-_PRESLIDING = 0.005  # rad or m
+_PRESLIDING, _SHORTEST = 0.005, 0.0005  # rad or m
 _FADED = 1e-6  # of friction at rest: never quite nothing
 _ONSET = 0.1  # rad/s or m/s
 _SLOWEST = 1e-6  # of that
@@ -66,7 +66,7 @@ class PreslidingFriction(ForceEffect):
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
         """Return the way, up to a tenth of the robot's."""
-        return {"presliding": (0.05 * self.presliding, 0.1 * _PRESLIDING, _farthest(reach))}
+        return {"presliding": (0.05 * self.presliding, _SHORTEST, _farthest(reach))}
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
         """Return 0 and 0.3 ``F_max``."""
@@ -91,15 +91,16 @@ class StribeckFriction(ForceEffect):
         force −k z,  ż = v − |v| z / (z_s e^{−(v/v_s)²}),  k = s / z_s,
 
     the law of Canudas de Wit, Olsson, Åström & Lischinsky, IEEE Transactions on Automatic Control
-    40 (1995), equations 1 to 4, with neither kinetic friction nor a damping of the bristles; solved
-    as that of `PreslidingFriction` is.
+    40 (1995), equations 1 to 4, with neither kinetic friction nor a damping of the bristles. It is
+    solved as that of `PreslidingFriction` is, with what has faded held over a time step.
 
     Args:
         speed: ``v_s``, rad/s or m/s. A diagnosis fits it.
-        presliding: ``z_s``, rad or m; 0 for none. A diagnosis fits it.
+        presliding: ``z_s``, rad or m; less than 0.0005 is 0, for none: bristles that stiff are
+            faster than a time step. A diagnosis fits it.
 
     Raises:
-        ValueError: ``presliding`` is negative.
+        ValueError: ``speed`` is not above 0, or ``presliding`` is negative.
 
     Example:
         >>> StribeckFriction(presliding=0.004).form
@@ -109,8 +110,9 @@ class StribeckFriction(ForceEffect):
     name, unit, group = "stribeck_friction", "N m", "friction"
 
     def __init__(self, speed: float = 0.2, presliding: float = 0.0) -> None:
+        check_number("speed at which friction fades", speed, above=0.0)
         check_number("presliding, a way before friction slides", presliding, least=0.0)
-        self.speed, self.presliding = speed, presliding
+        self.speed, self.presliding = speed, presliding if presliding >= _SHORTEST else 0.0
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
         """Return the speed, up to a quarter of the largest, and the way.
@@ -119,7 +121,7 @@ class StribeckFriction(ForceEffect):
         """
         return {
             "speed": (0.05 * self.speed, 0.02, max(0.25 * reach.velocity, self.speed)),
-            "presliding": (0.1 * _PRESLIDING, 0.0, _farthest(reach)),
+            "presliding": (_SHORTEST, 0.0, _farthest(reach)),
         }
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
@@ -156,11 +158,14 @@ def _bristles(
     """Return the force of bristles at the end of a time step, and how far they are bent by then.
 
     Args:
-        strength: ``s``.
-        memory: How far they are bent at its beginning.
+        strength: ``s``, shape ``(*batch, J)``.
+        memory: How far they are ``bent`` at its beginning, of the same shape; NaN if unknown.
         now: The time step.
         presliding: ``z_s``, for friction that has not faded.
-        level: What is left of friction at this speed.
+        level: What is left of friction at this speed, above 0 to 1, of the same shape.
+
+    Returns:
+        ``force`` and ``damping``, and the new memory.
     """
     sign, stiffness, way = now.velocity.sign(), strength / presliding, presliding * level
     slid = way * sign
