@@ -252,6 +252,17 @@ def test_one_place_comes_to_the_front_of_several_that_are_no_likelier(monkeypatc
     assert settled(found, "com_shift", sets).best is models[front]
 
 
+@pytest.mark.parametrize("fewer", [0, 1])
+def test_of_equals_one_of_fewer_causes_comes_to_the_front(monkeypatch, fewer):
+    """An offset and its change are one, whatever stands in the simulator for either."""
+    monkeypatch.setattr(confusion, "parts", lambda *_: [])
+    monkeypatch.setattr(confusion, "without_idle", lambda *given: given[-1])
+    found, *models = held_aside(1.0)
+    sets = dict.fromkeys(("train", "validation"))
+    causes = lambda model: 1 if model is models[fewer] else 2
+    assert settled(found, "com_shift", sets, causes=causes).best is models[fewer]
+
+
 def test_a_rival_beside_a_law_of_another_form_is_known_by_its_own_name():
     found, _, one = held_aside(1.0)
     assert confusion.stand_in(found, one) == "payload"

@@ -7,6 +7,7 @@ __all__ = ["assemble"]
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -79,7 +80,7 @@ def assemble(
     credit = credit_of(selection)
     for name in sorted(credit, key=lambda name: -credit[name]):
         if name in selection.best.names:
-            selection = settled(selection, name, prepared.sets)
+            selection = settled(selection, name, prepared.sets, causes=partial(_number, prepared))
     offered = selection.screens[0].units
     best = with_slopes_of_forms(prepared.sets["train"], selection.best, offered)
     selection = replace(selection, best=best)
@@ -182,6 +183,12 @@ def _causes(prepared: Prepared, selection: Selection) -> tuple[dict[str, float],
     together = unsteady_offsets(best, prepared.sets["train"].segments, robot)
     together |= dry_friction(best, credit, robot) | lateness(best, robot)
     return told_together(credit, together), together
+
+
+def _number(prepared: Prepared, model: Model) -> int:
+    """Return of how many causes a model is: an offset and its change are one."""
+    segments, robot = prepared.sets["train"].segments, prepared.predictor.system.robot
+    return len(model.names) - len(unsteady_offsets(model, segments, robot))
 
 
 def _every_unit(selection: Selection, scatter: Scatter) -> list[Unit]:

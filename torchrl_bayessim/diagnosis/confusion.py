@@ -5,7 +5,7 @@ from __future__ import annotations
 __all__ = ["confusion_set", "rivals", "settled", "stand_in"]
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from ..effects.effect import Effect
@@ -151,24 +151,38 @@ def stand_in(selection: Selection, rival: Model) -> str:
     return rival.instead(selection.best)[0].name
 
 
-def settled(selection: Selection, name: str, sets: Mapping[str, Objective]) -> Selection:
+def settled(
+    selection: Selection,
+    name: str,
+    sets: Mapping[str, Objective],
+    *,
+    causes: Callable[[Model], int] = lambda model: len(model.names),
+) -> Selection:
     """Return the selection with that one of equals in front that explains most.
 
     Of training and validation, with a price for each number: test runs choose nothing. Where more
     than noise is left, deviances count by so much less (quasi-likelihood, Wedderburn 1974), or the
     one with the most strengths would mend most of that. Of those that explain the same it is one of
-    the likeliest group, all its effects together; of late commands and late sensors, the one with
-    fewer faults of sensors, which needs no names of channels to be put on a simulator; of a law at
-    one place, such as a payload that is held aside, and another at several, the one place; of
-    twins, such as a bias of commands and a constant force, the drive's, which is looked at first,
-    and not the one that rounding prefers. And of equals that leave the other effects more and less
-    to make up for, the one that leaves less.
+    the fewest causes, and of the likeliest group, all its effects together; of late commands and
+    late sensors, the one with fewer faults of sensors, which needs no names of channels to be put
+    on a simulator; of a law at one place, such as a payload that is held aside, and another at
+    several, the one place; of twins, such as a bias of commands and a constant force, the drive's,
+    which is looked at first, and not the one that rounding prefers. And of equals that leave the
+    other effects more and less to make up for, the one that leaves less.
+
+    Args:
+        selection: What the search found.
+        name: The effect whose equals are looked at.
+        sets: Where models are fitted, ``train``, and where they are judged, ``validation``.
+        causes: Returns of how many causes a model is; default as many as it has effects.
     """
     start, best = selection.nominal, selection.best
     equals = [best, *(m for m in rivals(selection, name) if not only_more(start, best, m))]
     costs = {model: _cost(model, selection) for model in equals}
     least = min(costs.values())
     same = [model for model in equals if costs[model] - least < _SAME]
+    fewest = min(map(causes, same))
+    same = [model for model in same if causes(model) == fewest]
     same = _of_the_likeliest_group(same, costs, selection, name)
     simple = {model: (_sensing(model), len(model.units)) for model in same}
     first = min(same, key=lambda model: (*simple[model], costs[model]))
