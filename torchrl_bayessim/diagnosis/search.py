@@ -268,8 +268,8 @@ class Search:
         """Return the model without the effects that it does not need, its waves read off anew."""
         if any(unit.effect.placed for unit in best.units):
             self.progress("reading waves off anew")
-            best = with_waves_anew(self.sets, best, self.shapes, self.offered)
-            self.tried.append(best)
+            known, best = best, with_waves_anew(self.sets, best, self.shapes, self.offered)
+            self.tried += [best] if best is not known else []
         self.progress("taking out what is not needed")
         needs, dropped = eliminated(*self.sets, best)
         if len(needs.units) < len(best.units):

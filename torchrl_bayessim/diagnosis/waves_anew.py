@@ -70,7 +70,7 @@ def _anew(
 
 
 def _same_rate(one: Unit, other: Unit) -> bool:
-    """Return whether two waves have the same frequency, or number, but for a few per cent."""
+    """Return whether two waves have the same frequency, or number, but for 2 %."""
     rate = one.effect.placed[0]
     mine, others = one.effect.form[rate], other.effect.form[rate]
     return abs(mine - others) < _SAME * others
