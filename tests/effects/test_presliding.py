@@ -35,6 +35,20 @@ def turned(model, laws, torque, seconds):
     return np.array([data.qpos[0] for data in driven(model, robot, active, commands)])
 
 
+def to_and_fro(t):
+    """Return a torque that turns the wheel one way and the other."""
+    return 1.2 * FRICTION * math.sin(5 * t) + 0.3 * math.sin(13 * t)
+
+
+def solved(rates, seconds, dt):
+    """Return the angles of the differential equation of angle, speed and bristles, from rest."""
+    ends = np.arange(1, round(seconds / dt) + 1) * dt
+    found = solve_ivp(
+        rates, (0, seconds), [0, 0, 0], t_eval=ends, rtol=1e-9, atol=1e-10, method="LSODA"
+    )
+    return found.y[0]
+
+
 @pytest.mark.parametrize("share", [0.2, 0.7])
 def test_what_sticks_gives_way_by_as_much_as_dahl_says(share):
     way = 0.03
@@ -45,51 +59,39 @@ def test_what_sticks_gives_way_by_as_much_as_dahl_says(share):
 
 @pytest.mark.parametrize("way", [0.005, 0.1])
 def test_a_wheel_follows_the_differential_equation(way):
-    def torque(t):
-        return 1.2 * FRICTION * math.sin(5 * t) + 0.3 * math.sin(13 * t)
-
     def rates(t, state):
         _, v, z = state
         held = FRICTION * z / way
-        return v, (torque(t) - held) / INERTIA, v - abs(v) * z / way
+        return v, (to_and_fro(t) - held) / INERTIA, v - abs(v) * z / way
 
     seconds, dt = 2.0, 0.0005
-    ends = np.arange(1, round(seconds / dt) + 1) * dt
-    true = solve_ivp(
-        rates, (0, seconds), [0, 0, 0], t_eval=ends, rtol=1e-9, atol=1e-10, method="LSODA"
-    )
+    true = solved(rates, seconds, dt)
     law = effect("coulomb_friction", presliding=way)
-    angles = turned(wheel(dt), [law], torque, seconds)
-    largest = np.abs(true.y[0]).max()
-    assert np.abs(angles - true.y[0]).max() < 0.01 * largest
-    other = turned(wheel(dt), [PreslidingFriction(2 * way)], torque, seconds)
-    assert np.abs(other - true.y[0]).max() > 0.02 * largest
+    angles = turned(wheel(dt), [law], to_and_fro, seconds)
+    largest = np.abs(true).max()
+    assert np.abs(angles - true).max() < 0.01 * largest
+    other = turned(wheel(dt), [PreslidingFriction(2 * way)], to_and_fro, seconds)
+    assert np.abs(other - true).max() > 0.02 * largest
 
 
 @pytest.mark.parametrize("speed", [0.2, 0.6])
 def test_a_wheel_whose_friction_fades_follows_the_differential_equation(speed):
     way = 0.02
 
-    def torque(t):
-        return 1.2 * FRICTION * math.sin(5 * t) + 0.3 * math.sin(13 * t)
-
     def rates(t, state):
         _, v, z = state
         level = way * math.exp(-((v / speed) ** 2))
         bent = v - abs(v) * z / level if level > 1e-6 * way else -1e3 * z
-        return v, (torque(t) - FRICTION * z / way) / INERTIA, bent
+        return v, (to_and_fro(t) - FRICTION * z / way) / INERTIA, bent
 
     seconds, dt = 1.0, 0.0005
-    ends = np.arange(1, round(seconds / dt) + 1) * dt
-    true = solve_ivp(
-        rates, (0, seconds), [0, 0, 0], t_eval=ends, rtol=1e-9, atol=1e-10, method="LSODA"
-    )
-    largest = np.abs(true.y[0]).max()
+    true = solved(rates, seconds, dt)
+    largest = np.abs(true).max()
     law = effect("stribeck_friction", speed=speed, presliding=way)
-    angles = turned(wheel(dt), [law], torque, seconds)
-    assert np.abs(angles - true.y[0]).max() < 0.01 * largest
-    other = turned(wheel(dt), [effect("stribeck_friction", speed=speed)], torque, seconds)
-    assert np.abs(other - true.y[0]).max() > 0.05 * largest
+    angles = turned(wheel(dt), [law], to_and_fro, seconds)
+    assert np.abs(angles - true).max() < 0.01 * largest
+    other = turned(wheel(dt), [effect("stribeck_friction", speed=speed)], to_and_fro, seconds)
+    assert np.abs(other - true).max() > 0.05 * largest
 
 
 def test_ways_that_no_time_step_resolves_are_none():

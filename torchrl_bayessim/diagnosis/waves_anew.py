@@ -57,11 +57,9 @@ def _anew(
     offered: Collection[Unit],
 ) -> Model | None:
     """Return the model with a wave of another rate that explains more, if there is one."""
-    point = model.fit.point
-    others = {unit: strength for unit, strength in point.strengths.items() if unit != wave}
-    base = refit(sets[0], [Point(point.z, others)], iterations=_STEPS)[0].point
+    base = refit(sets[0], [model.fit.without(wave).point], iterations=_STEPS)[0].point
     seen = [u for u in shapes(base) if u.place == wave.place and not _same_rate(u, wave)]
-    starts = [base.beside({u: u.inside(point.strengths[wave])}) for u in seen]
+    starts = [base.beside({u: u.inside(model.fit.point.strengths[wave])}) for u in seen]
     found = judged_fits(*sets, starts) if starts else []
     formed = [with_fitted_forms(*sets, m, offered, race=model.fit.cost) for m in found]
     best = min(formed, key=lambda m: m.fit.cost, default=model)
