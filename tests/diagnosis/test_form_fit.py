@@ -157,6 +157,18 @@ def test_bristles_are_dry_friction_with_the_way_that_they_bend():
     assert report.gap.with_effects < 1.3
 
 
+def test_friction_that_fades_to_some_of_it_is_one_law():
+    """Not Coulomb friction and what fades beside it."""
+    some = ["coulomb_friction", "stribeck_friction", "viscous_friction", "parallel_spring"]
+    fades = logs(push=lambda _, v: -0.6 * (0.25 + 0.75 * np.exp(-((v / 0.4) ** 2))) * np.sign(v))
+    report = diagnose(robot(), None, fades, effects=some)
+    assert [effect.name for effect in report.effects] == ["stribeck_friction"]
+    (found,) = report.strengths
+    assert found.kinetic == pytest.approx(0.25, abs=0.05)
+    assert found.speed == pytest.approx(0.4, rel=0.1)
+    assert f"{found.kinetic:.0%} of it at any speed" in str(report)
+
+
 def test_friction_of_one_direction_that_begins_softly_has_the_speed_over_which_it_does():
     some = ["coulomb_friction", "directional_friction", "viscous_friction", "action_bias"]
     soft = logs(10, push=lambda q, v: -0.3 * (1 - np.exp(-v / 0.8)) if v > 0 else 0.0)

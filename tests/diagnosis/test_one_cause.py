@@ -25,11 +25,12 @@ LAWS = "coulomb_friction", "stribeck_friction"
 FIRST, SECOND = ROBOT.joints[:2]
 
 
-def found(places, names=LAWS, strengths=(0.2, 0.1), robot=ROBOT):
-    """Return a model of two laws, each at a target or at all."""
+def found(places, names=LAWS, strengths=(0.2, 0.1), robot=ROBOT, *, last=None):
+    """Return a model of laws, each at a target or at all, the last of this form."""
+    laws = [*map(effect, names[:-1]), effect(names[-1], **(last or {}))]
     units = [
-        next(u for u in units_of([effect(name)], robot) if u.where == place)
-        for name, place in zip(names, places, strict=True)
+        next(u for u in units_of([law], robot) if u.where == place)
+        for law, place in zip(laws, places, strict=True)
     ]
     point = Point(np.zeros(1), dict(zip(units, strengths, strict=True)))
     names = dict.fromkeys(unit.name for unit in units).keys()
@@ -61,6 +62,9 @@ def test_an_alarm_tells_both_ends_of_the_curve():
     (alarm,) = dry_friction_alarms(found((FIRST, FIRST)), {LAWS[1]: LAWS[0]}, ROBOT)
     assert f"friction at {FIRST} fades with speed, from 0.3 to 0.2 N m" in alarm
     assert dry_friction_alarms(found((FIRST, FIRST)), {}, ROBOT) == []
+    partly = found((FIRST, FIRST), last={"kinetic": 0.4})
+    (alarm,) = dry_friction_alarms(partly, {LAWS[1]: LAWS[0]}, ROBOT)
+    assert "from 0.3 to 0.24 N m" in alarm
 
 
 FILTERED = "sensor_lag", "sensor_delay"

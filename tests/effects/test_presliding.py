@@ -74,30 +74,33 @@ def test_a_wheel_follows_the_differential_equation(way):
     assert np.abs(other - true).max() > 0.02 * largest
 
 
-@pytest.mark.parametrize("speed", [0.2, 0.6])
-def test_a_wheel_whose_friction_fades_follows_the_differential_equation(speed):
+@pytest.mark.parametrize(("speed", "kinetic"), [(0.2, 0.0), (0.6, 0.0), (0.2, 0.3)])
+def test_a_wheel_whose_friction_fades_follows_the_differential_equation(speed, kinetic):
     way = 0.02
 
     def rates(t, state):
         _, v, z = state
-        level = way * math.exp(-((v / speed) ** 2))
+        level = way * (kinetic + (1 - kinetic) * math.exp(-((v / speed) ** 2)))
         bent = v - abs(v) * z / level if level > 1e-6 * way else -1e3 * z
         return v, (to_and_fro(t) - FRICTION * z / way) / INERTIA, bent
 
     seconds, dt = 1.0, 0.0005
     true = solved(rates, seconds, dt)
     largest = np.abs(true).max()
-    law = effect("stribeck_friction", speed=speed, presliding=way)
+    law = effect("stribeck_friction", speed=speed, presliding=way, kinetic=kinetic)
     angles = turned(wheel(dt), [law], to_and_fro, seconds)
     assert np.abs(angles - true).max() < 0.01 * largest
-    other = turned(wheel(dt), [effect("stribeck_friction", speed=speed)], to_and_fro, seconds)
-    assert np.abs(other - true).max() > 0.05 * largest
+    for form in ({"presliding": 0.0}, {"kinetic": kinetic + 0.1}):
+        other = turned(
+            wheel(dt), [effect("stribeck_friction", **{**law.form, **form})], to_and_fro, seconds
+        )
+        assert np.abs(other - true).max() > 0.03 * largest
 
 
 def test_ways_that_no_time_step_resolves_are_none():
     assert effect("stribeck_friction", presliding=4e-4) == effect("stribeck_friction")
     least = effect("stribeck_friction", presliding=5e-4)
-    assert least.form == {"speed": 0.2, "presliding": 5e-4}
+    assert least.form == {"speed": 0.2, "presliding": 5e-4, "kinetic": 0.0}
 
     def torque(t):
         return 2 * FRICTION * math.sin(5 * t)
@@ -111,6 +114,9 @@ def test_what_friction_that_fades_may_not_be():
         effect("stribeck_friction", presliding=-0.1)
     with pytest.raises(ValueError, match="speed at which friction fades"):
         effect("stribeck_friction", speed=0.0)
+    for share in (-0.1, 1.1):
+        with pytest.raises(ValueError, match="kinetic, a share of friction"):
+            effect("stribeck_friction", kinetic=share)
 
 
 def test_bristles_that_spring_back_as_friction_fades_do_not_drive_the_joint():

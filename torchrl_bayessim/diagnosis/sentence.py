@@ -25,6 +25,7 @@ _BENT = {
     "settling": ", settling at {:.2g} per second",
     "second": ", {:.0%} of it in a second filter",
     "presliding": ", after {:.2g} of presliding", "onset": ", beginning over a speed of {:.2g}",
+    "kinetic": ", {:.0%} of it at any speed",
     "aside": ", {:+.2g} of its distance beside the end",
     "wind": ", wound up by {:.2g} of its width",
     "external": ", of the load with what acts from outside",

@@ -82,7 +82,7 @@ def effect(name: str, **options: Any) -> Effect:
 
     Example:
         >>> effect("stribeck_friction", speed=0.1)
-        StribeckFriction(speed=0.1, presliding=0.0)
+        StribeckFriction(speed=0.1, presliding=0.0, kinetic=0.0)
 
     Raises:
         KeyError: The catalogue has no such effect.

@@ -31,6 +31,7 @@ from .laws import within
 from .robot import Robot
 
 _PRESLIDING, _SHORTEST = 0.005, 0.0005  # rad or m
+_KINETIC = 0.5  # of friction at rest
 _FADED = 1e-6  # of friction at rest: never quite nothing
 _ONSET = 0.1  # rad/s or m/s
 _SLOWEST = 1e-6  # of that
@@ -84,44 +85,53 @@ class PreslidingFriction(ForceEffect):
 
 
 class StribeckFriction(ForceEffect):
-    """Dry friction that fades with speed: ``s e^{−(v/v_s)²}``; N m or N, up to 30 % of ``F_max``.
+    """Dry friction that fades with speed: ``s g``; N m or N, up to 30 % of ``F_max``.
 
-    With presliding it gives way before it slides, as bristles that are bent by ``z`` do::
+    All of it or most: ``g = c + (1 − c) e^{−(v/v_s)²}``, with kinetic friction ``c s``. With
+    presliding it gives way before it slides, as bristles that are bent by ``z`` do::
 
-        force −k z,  ż = v − |v| z / (z_s e^{−(v/v_s)²}),  k = s / z_s,
+        force −k z,  ż = v − |v| z / (z_s g),  k = s / z_s,
 
     the law of Canudas de Wit, Olsson, Åström & Lischinsky, IEEE Transactions on Automatic Control
-    40 (1995), equations 1 to 4, with neither kinetic friction nor a damping of the bristles. It is
-    solved as that of `PreslidingFriction` is, with what has faded held over a time step.
+    40 (1995), equations 1 to 4, without a damping of the bristles. It is solved as that of
+    `PreslidingFriction` is, with what has faded held over a time step.
 
     Args:
         speed: ``v_s``, rad/s or m/s. A diagnosis fits it.
         presliding: ``z_s``, rad or m; less than 0.0005 is 0, for none: bristles that stiff are
             faster than a time step. A diagnosis fits it.
+        kinetic: ``c``, from 0 to 1. A diagnosis fits it, up to a half: what fades less is Coulomb
+            friction, for the most part.
 
     Raises:
-        ValueError: ``speed`` is not above 0, or ``presliding`` is negative.
+        ValueError: ``speed`` is not above 0, ``presliding`` is negative, or ``kinetic`` is outside
+            0 to 1.
 
     Example:
-        >>> StribeckFriction(presliding=0.004).form
-        {'speed': 0.2, 'presliding': 0.004}
+        >>> StribeckFriction(presliding=0.004, kinetic=0.1).form
+        {'speed': 0.2, 'presliding': 0.004, 'kinetic': 0.1}
     """
 
     name, unit, group = "stribeck_friction", "N m", "friction"
 
-    def __init__(self, speed: float = 0.2, presliding: float = 0.0) -> None:
+    def __init__(
+        self, speed: float = 0.2, presliding: float = 0.0, *, kinetic: float = 0.0
+    ) -> None:
         check_number("speed at which friction fades", speed, above=0.0)
         check_number("presliding, a way before friction slides", presliding, least=0.0)
+        check_number("kinetic, a share of friction", kinetic, least=0.0, most=1.0)
         self.speed, self.presliding = speed, presliding if presliding >= _SHORTEST else 0.0
+        self.kinetic = kinetic
 
     def free(self, reach: Reach) -> Mapping[str, tuple[float, float, float]]:
-        """Return the speed, up to a quarter of the largest, and the way.
+        """Return the speed, up to a quarter of the largest, the way, and what does not fade.
 
         Beyond that speed friction hardly fades.
         """
         return {
             "speed": (0.05 * self.speed, 0.02, max(0.25 * reach.velocity, self.speed)),
             "presliding": (_SHORTEST, 0.0, _farthest(reach)),
+            "kinetic": (0.02, 0.0, max(_KINETIC, self.kinetic)),
         }
 
     def bounds(self, robot: Robot) -> tuple[Tensor, Tensor]:
@@ -136,7 +146,8 @@ class StribeckFriction(ForceEffect):
         self, strength: Tensor, memory: Memory, now: Now
     ) -> tuple[Mapping[str, Tensor], Memory]:
         """Return the dry friction at this speed, or the bristles' force."""
-        level = torch.exp(-((now.velocity / self.speed) ** 2))
+        faded = torch.exp(-((now.velocity / self.speed) ** 2))
+        level = self.kinetic + (1 - self.kinetic) * faded
         if not self.presliding:
             return {"frictionloss": strength * level}, memory
         level = level.clamp(min=_FADED)
