@@ -8,11 +8,10 @@ once per candidate, effects on forces at every time step. What is returned is th
 
 from __future__ import annotations
 
-__all__ = ["Predictor", "fewest_parts"]
+__all__ = ["Predictor"]
 
 import copy
-from collections.abc import Mapping, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import mujoco
@@ -20,31 +19,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
-from torch import Tensor
 
-from ..effects.effect import (
-    ForceEffect,
-    Memory,
-    ModelEffect,
-)
+from ..effects.effect import ForceEffect, ModelEffect
 from ..effects.fields import ModelFields
-from ..effects.forcing import Forcing
-from ..effects.sequence import forces_in_stages
-from ..envs.bias_forces import BeforeStep, BiasForces
-from ..envs.held_command import HeldCommand
 from ..envs.model_batch import ModelBatch
 from ..envs.stepper import Stepper
-from ..envs.task import Readings
 from ..logs.system import System
 from ..physics.dry_friction import FIELDS, follow_velocity
 from .commands import commanded
 from .segments import Segments
 from .sensing import Sensing
+from .stepwise import Stepwise, fewest_parts
 from .strengths import Strengths, with_late_commands
 from .tangent import Tangent
 
 Array = NDArray[np.float64]
-_HELD = 0.010  # s that forces may be held while searching
 _ROWS = 30_000  # simulations per native call: bounds the memory, and costs nothing
 
 
@@ -92,7 +81,6 @@ class Predictor:
         self.exact = False
         self.realisation = 0
         self._threads = threads
-        self._forcing = Forcing(system.robot)
         self._divide(substeps or system.task.frame_skip)
 
     def _divide(self, substeps: int) -> None:
@@ -109,13 +97,10 @@ class Predictor:
             # one tree is one island at most: looking for it changes no bit, and takes a twelfth
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
         self._models = ModelBatch(model, 1)
-        # from the beginning, since what one table overrides stays in a thread's model after it
-        self._entries = {
-            name: np.array([self._models.column(name, (d,)) for d in range(self.tangent.size)])
-            for name in ("dof_frictionloss", "dof_damping")
-        }
         self._stepper = Stepper(model, 1, drive=task.drive, threads=self._threads)
-        self._bias = BiasForces(self._stepper)
+        self._stepwise = Stepwise(
+            self._stepper, self._models, self.system.robot, dt=task.dt, substeps=substeps
+        )
 
     def _own_friction(self, model: mujoco.MjModel) -> list[int]:
         """Return the degrees of freedom whose dry friction is among the parameters."""
@@ -217,7 +202,8 @@ class Predictor:
         offsets: Array | None = None,
     ) -> Array:
         """Return what follows from the start states, shape ``(P, S, H, outputs)``."""
-        count, size, horizon, at = len(theta), len(segments), segments.horizon, segments.history
+        task, at = self.system.task, segments.history
+        count, size, horizon = len(theta), len(segments), segments.horizon
         actions, sequence = commanded(
             self.system.robot, segments, strengths, count, seed=self.realisation
         )
@@ -261,14 +247,14 @@ class Predictor:
                 outputs=simulated,
             )
         if hooked.any():
-            some = {e: s[hooked] for e, s in strengths.items() if isinstance(e, ForceEffect)}
             pushed = rows[hooked].reshape(-1)
-            self._push(
+            self._stepwise.rollout(
                 segments,
-                some,
+                {e: s[hooked] for e, s in strengths.items() if isinstance(e, ForceEffect)},
                 rows=pushed,
                 commands=whole[sequence[pushed]],
-                simulated=simulated,
+                outputs=simulated,
+                parts=self.substeps if self.exact else fewest_parts(self.substeps, task.dt),
             )
         return simulated.reshape(count, size, horizon, -1)
 
@@ -278,61 +264,6 @@ class Predictor:
         if convert is None:
             return actions
         return np.ascontiguousarray(convert(torch.from_numpy(actions)).detach().double().numpy())
-
-    def _push(
-        self,
-        segments: Segments,
-        strengths: Mapping[ForceEffect, Array],
-        *,
-        rows: NDArray[np.int64],
-        commands: Array,
-        simulated: Array,
-    ) -> None:
-        """Simulate ``rows`` with forces of their own, one time step after the other.
-
-        Of commands there are those of the whole windows, up to the horizon.
-        """
-        stepper, models = self._stepper, self._stepper.models
-        active = [
-            (e, torch.from_numpy(np.repeat(strengths[e], len(segments), axis=0)))
-            for e in forces_in_stages(strengths)
-        ]
-        memories = self._warm(segments, active, commands)
-        commands = commands[:, segments.history :]
-        nominal = {name: models.table[rows][:, at] for name, at in self._entries.items()}
-        command = np.empty((stepper.num_envs, 1, commands.shape[2]))
-        alive = np.ones(len(rows), dtype=bool)
-        parts = self.substeps if self.exact else fewest_parts(self.substeps, self.system.task.dt)
-        held = self.system.task.dt / parts
-        for t in range(segments.horizon):
-            kept = HeldCommand(stepper, rows)
-            ctrl = torch.from_numpy(kept.controls(commands[:, t]))
-            for left in reversed(range(parts)):
-                state = {n: torch.from_numpy(stepper[n][rows]) for n in ("qpos", "qvel", "time")}
-                now = BeforeStep(partial(self._bias_of, rows), **state, ctrl=ctrl)
-                added, memories = self._forcing(active, memories, now, timestep=held)
-                for name, at in self._entries.items():
-                    if name in added:
-                        models.table[np.ix_(rows, at)] = nominal[name] + added[name].numpy()
-                if "qfrc_applied" in added:
-                    stepper["qfrc_applied"][rows] = added["qfrc_applied"].numpy()
-                command[rows, 0] = kept.again(commands[:, t])
-                if "ctrl" in added:
-                    command[rows, 0, : ctrl.shape[1]] += added["ctrl"].numpy()
-                going = rows[alive]
-                stepper.rollout(
-                    command,
-                    substeps=self.substeps // parts,
-                    rows=going,
-                    outputs=stepper.outputs,
-                    ends=not left,
-                )
-                alive[alive] = stepper.status[going] == 0
-            simulated[rows[alive], t] = stepper.outputs[rows[alive], 0]
-
-    def _bias_of(self, rows: NDArray[np.int64], some: NDArray[np.int64] | None = None) -> Tensor:
-        """Return ``qfrc_bias`` of rows, or of some among them."""
-        return self._bias(rows if some is None else rows[some])
 
     def _place_welds(self) -> None:
         """Let the first command step from where the welded body is in each start state.
@@ -347,35 +278,6 @@ class Predictor:
         stepper.begin()
         starts[:, stepper.components["weld_pose"]] = stepper["weld_pose"]
         stepper.state[:] = starts
-
-    def _warm(
-        self, segments: Segments, active: Sequence[tuple[ForceEffect, Tensor]], commands: Array
-    ) -> list[Memory]:
-        """Run hidden states along the measured motion and commands that lead to the start."""
-        count = len(commands) // len(segments)
-        relative = self._stepper.relative
-        moved = np.flatnonzero(relative >= 0)
-
-        def measured(k: int) -> Readings:
-            values = {"qpos": segments.qpos, "qvel": segments.qvel}
-            values["time"] = segments.time[..., None]
-            # what depends on it remembers nothing
-            values["qfrc_bias"] = np.zeros_like(segments.qvel)
-            tiled = {n: np.tile(v[:, k], (count, 1)) for n, v in values.items()}
-            tiled["ctrl"] = commands[:, k, : len(relative)].copy()
-            tiled["ctrl"][:, moved] += tiled["qpos"][:, relative[moved]]
-            return Readings(**{n: torch.from_numpy(v) for n, v in tiled.items()})
-
-        first = measured(0)
-        memories = self._forcing.start(active, first)
-        if any(memories):
-            kept = self._forcing.lasting(active, memories, first)
-            some, told = [active[i] for i in kept], [memories[i] for i in kept]
-            for k in range(segments.history):
-                _, told = self._forcing(some, told, measured(k), timestep=self.system.task.dt)
-            for i, memory in zip(kept, told, strict=True):
-                memories[i] = memory
-        return memories
 
     def _write(self, theta: Array, strengths: Strengths) -> None:
         """Set the model entries of every candidate: parameters first, then effects on top."""
@@ -393,10 +295,3 @@ class Predictor:
             if isinstance(effect, ModelEffect):
                 effect.write(fields, torch.from_numpy(values), self.system.robot)
         fields.finish()
-
-
-def fewest_parts(substeps: int, dt: float) -> int:
-    """Return into how many equal parts a control step is divided, each 10 ms at most."""
-    fewest = max(1, int(np.ceil(dt / _HELD - 1e-9)))
-    whole = (n for n in range(fewest, substeps + 1) if substeps % n == 0)
-    return next(whole, substeps)

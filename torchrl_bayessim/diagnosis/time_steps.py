@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from .model import Model, judged_fits
 from .objective import Objective, Point, Unit, parameters_at, strengths_of
-from .prediction import Predictor, fewest_parts
+from .prediction import Predictor
 from .segments import Segments
+from .stepwise import fewest_parts
 
 Array = NDArray[np.float64]
 _UNSEEN = 0.02  # standard deviations of the noise
