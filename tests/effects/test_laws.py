@@ -282,8 +282,9 @@ def forces(name, strength, *, qvel=0.0, qpos=0.0, ctrl=(0.0, 0.0, 0.0), time=0.0
 def test_friction_laws():
     at = pytest.approx
     assert forces("stribeck_friction", 2.0, qvel=0.2)["dof_frictionloss"] == at([2 / math.e] * 4)
-    partly = forces("stribeck_friction", 2.0, qvel=9.0, kinetic=0.3)["dof_frictionloss"]
-    assert partly == at([0.6] * 4)  # what does not fade
+    partly = forces("stribeck_friction", 2.0, qvel=0.2, kinetic=0.3)["dof_frictionloss"]
+    assert partly == at([0.6 + 1.4 / math.e] * 4)
+    assert forces("stribeck_friction", 2.0, qvel=0.2, kinetic=1.0)["dof_frictionloss"] == [2.0] * 4
     assert forces("quadratic_drag", 2.0, qvel=-3.0)["dof_damping"] == at([6.0] * 4)
     assert forces("quadratic_drag", 2.0, qvel=-3.0, power=2.5)["dof_damping"] == at(
         [2 * 3**1.5] * 4

@@ -48,7 +48,8 @@ def dry_friction(model: Model, credit: Mapping[str, float], robot: Robot) -> dic
 
     The Stribeck curve, ``F_c + (F_s − F_c) e^{−(v/v_s)²}`` (Armstrong-Hélouvry, Dupont & Canudas de
     Wit 1994), is Coulomb friction and what fades with speed: one friction, where both are at the
-    same joints. The law of more credit gives the name, of equal ones Coulomb's.
+    same joints, as they are where most of it stays. The law of more credit gives the name, of equal
+    ones Coulomb's.
 
     Args:
         model: With the effects that were found.

@@ -87,13 +87,13 @@ class PreslidingFriction(ForceEffect):
 class StribeckFriction(ForceEffect):
     """Dry friction that fades with speed: ``s g``; N m or N, up to 30 % of ``F_max``.
 
-    All of it or most: ``g = c + (1 − c) e^{−(v/v_s)²}``, with kinetic friction ``c s``. With
+    To ``c`` of it: ``g = c + (1 − c) e^{−(v/v_s)²}``, where ``c s`` is kinetic friction. With
     presliding it gives way before it slides, as bristles that are bent by ``z`` do::
 
         force −k z,  ż = v − |v| z / (z_s g),  k = s / z_s,
 
     the law of Canudas de Wit, Olsson, Åström & Lischinsky, IEEE Transactions on Automatic Control
-    40 (1995), equations 1 to 4, without a damping of the bristles. It is solved as that of
+    40 (1995), without a damping of the bristles and viscous friction. It is solved as that of
     `PreslidingFriction` is, with what has faded held over a time step.
 
     Args:
