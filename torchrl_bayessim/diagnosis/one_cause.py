@@ -13,8 +13,7 @@ __all__ = [
     "told_together",
 ]
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 from ..effects.action import ActionDelay, ActionLag
 from ..effects.friction import StribeckFriction
@@ -72,7 +71,13 @@ def dry_friction_alarms(model: Model, told: Mapping[str, str], robot: Robot) -> 
         robot: Where they act.
     """
     always, fading = (_by_target(model, name, robot) for name in _LAWS)
-    kinetic = _by_target(model, StribeckFriction.name, robot, share=lambda law: law.kinetic)
+    strengths = model.fit.point.strengths
+    kept = {
+        unit: unit.effect.kinetic * unit.actual(strengths[unit])
+        for unit in model.units
+        if isinstance(unit.effect, StribeckFriction)
+    }
+    kinetic = at_targets(kept, robot)
     return [
         f"friction at {joint} fades with speed, from {always[joint] + fading[joint]:.3g} to "
         f"{always[joint] + kinetic[joint]:.3g} {_measure(model, robot)}: in the simulator "
@@ -134,10 +139,7 @@ def _measure(model: Model, robot: Robot) -> str:
     return unit.measured_in(robot)
 
 
-def _by_target(
-    model: Model, name: str, robot: Robot, *, share: Callable[[Any], float] = lambda _: 1.0
-) -> dict[str, float]:
-    """Return the strength of a law at each target where it acts, or a share of it."""
+def _by_target(model: Model, name: str, robot: Robot) -> dict[str, float]:
+    """Return the strength of a law at each target where it acts."""
     strengths = model.fit.point.strengths
-    units = [unit for unit in model.units if unit.name == name]
-    return at_targets({u: share(u.effect) * u.actual(strengths[u]) for u in units}, robot)
+    return at_targets({u: u.actual(strengths[u]) for u in model.units if u.name == name}, robot)

@@ -20,6 +20,7 @@ from ..effects.effect import ForceEffect, Memory
 from ..effects.forcing import Forcing
 from ..effects.robot import Robot
 from ..effects.sequence import forces_in_stages
+from ..envs.additions import ADDED
 from ..envs.bias_forces import BeforeStep, BiasForces
 from ..envs.held_command import HeldCommand
 from ..envs.model_batch import ModelBatch
@@ -29,7 +30,6 @@ from .segments import Segments
 
 Array = NDArray[np.float64]
 _HELD = 0.010  # s that forces may be held while searching
-_FIELDS = "dof_frictionloss", "dof_damping"  # of the model, which forces change
 
 
 class Stepwise:
@@ -50,7 +50,7 @@ class Stepwise:
         self._stepper, self._dt, self._substeps = stepper, dt, substeps
         self._entries = {
             name: np.array([models.column(name, (d,)) for d in range(models.model.nv)])
-            for name in _FIELDS
+            for name in ADDED
         }
         self._forcing = Forcing(robot)
         self._bias = BiasForces(stepper)

@@ -9,7 +9,7 @@ Where there was no dry friction, what is added follows the velocity (`dry_fricti
 
 from __future__ import annotations
 
-__all__ = ["Addition", "rollout_with", "steps_with"]
+__all__ = ["ADDED", "Addition", "rollout_with", "steps_with"]
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
@@ -27,7 +27,7 @@ from .model_batch import ModelBatch
 from .stepper import Stepper
 
 Addition = Callable[[BeforeStep], Mapping[str, Tensor]]
-_ADDED = "dof_frictionloss", "dof_damping"
+ADDED = "dof_frictionloss", "dof_damping"  # of a model, which an addition may raise
 _Array = NDArray[np.float64]
 _Entry = tuple[str, tuple[int, ...]]
 
@@ -90,7 +90,7 @@ class _Resistance:
     def __init__(self, models: ModelBatch) -> None:
         self._models = models
         dofs = range(models.model.nv)
-        self._own = {f: [models.read(f, (d,)) for d in dofs] for f in _ADDED}
+        self._own = {f: [models.read(f, (d,)) for d in dofs] for f in ADDED}
         self._before: dict[_Entry, _Array] = {}
 
     def add(self, added: Mapping[str, _Array]) -> None:
@@ -126,7 +126,7 @@ def steps_with(
 ) -> None:
     """Step one simulation ``count`` times under its present controls, with additions each time."""
     control, applied = data.ctrl.copy(), data.qfrc_applied.copy()
-    base = {field: getattr(model, field).copy() for field in {*_ADDED, *FIELDS}}
+    base = {field: getattr(model, field).copy() for field in {*ADDED, *FIELDS}}
     followed = False
     try:
         for _ in range(count):
@@ -140,7 +140,7 @@ def steps_with(
             if "dof_frictionloss" in added and not followed:
                 follow_velocity(model)
                 followed = True
-            for field in _ADDED:
+            for field in ADDED:
                 getattr(model, field)[:] = base[field] + added.get(field, 0.0)
             mujoco.mj_step(model, data)
     finally:
